@@ -1,0 +1,119 @@
+"""Adjustment of a bundle of rays: Gauss-Newton with a robust start, blunders rejected, bad cameras named.
+
+The same function serves stage 1 (one block, free of any network) and the judgement of a sub-MIN's rays (all that a tile holds). Its result is the
+accepted rays, the released cameras, and the state at which to linearise; never a dense covariance of ground points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from submin.adjustment.blunders import bad_cameras, image_statistics, reject_blunders, residuals, robust_weights
+from submin.adjustment.elimination import LinearRays, eliminate, ground_corrections, linearise, point_factors
+from submin.adjustment.estimation import ImageEstimate, estimate_images, prior_variance
+from submin.adjustment.images import ImageSet
+from submin.adjustment.rays import Rays
+
+Array = NDArray[np.float64]
+
+ROBUST_ITERATIONS = 6
+MAX_ITERATIONS = 40
+FREE_DECISIONS = 12
+"""Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
+CONVERGED_PIXELS = 1e-6
+CONVERGED_METRES = 1e-5
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Result of adjusting a bundle of rays.
+
+    Attributes
+    ----------
+    theta : (m, p) corrections of the images
+    ground : (n, 3) geocentric positions, metres (a point that is not determined stays where it was)
+    accepted : (r,) False for blunders
+    statistic : (r,) test statistic of each ray when it was last judged
+    released : (m,) True for images whose a priori model was released because their camera is bad
+    image_statistic : (m,) largest test statistic of each image against its a priori model, when it was judged bad, else the last one
+    ray_rms_px : root mean square of the accepted rays' residuals per coordinate, pixels
+    converged : False when the iterations ran out
+    iterations : how many there were
+    """
+
+    theta: Array
+    ground: Array
+    accepted: NDArray[np.bool_]
+    statistic: Array
+    released: NDArray[np.bool_]
+    image_statistic: Array
+    ray_rms_px: float
+    converged: bool
+    iterations: int
+
+
+def adjust(images: ImageSet, rays: Rays, start: Array) -> Adjustment:
+    """Adjust m images and n ground points by their rays, from ground positions ``start`` (n, 3) and unadjusted cameras.
+
+    Raises
+    ------
+    NumericalError
+        When the rays' information is not finite or not positive definite.
+    """
+    theta = np.zeros((len(images), images.parameters))
+    ground = start.copy()
+    candidates = rays.accepted.astype(np.float64)
+    weight = candidates.copy()
+    for _ in range(ROBUST_ITERATIONS):
+        linear, estimate, moved = _step(images, rays, theta, ground, weight)
+        theta, ground = estimate.theta, ground + moved
+        weight = robust_weights(linear, candidates, theta)
+
+    weight = (weight > 0.05).astype(np.float64)
+    released = np.zeros(len(images), dtype=bool)
+    image_statistic = np.zeros(len(images))
+    statistic = np.zeros(len(rays))
+    converged, iteration = False, 0
+    while not converged and iteration < MAX_ITERATIONS:
+        iteration += 1
+        linear, estimate, moved = _step(images, rays, theta, ground, weight)
+        step_px = np.abs(estimate.theta - theta).max(initial=0.0)
+        step_m = np.abs(moved).max(initial=0.0)
+        theta, ground = estimate.theta, ground + moved
+        judged, statistic = reject_blunders(
+            linear, candidates if iteration <= FREE_DECISIONS else weight, theta, estimate.covariance
+        )  # fmt: skip
+        worst = image_statistics(theta, estimate.covariance, prior_variance(images.prior, images.parameters))
+        bad = bad_cameras(worst, _linked(estimate, linear, len(images))) & ~released
+        image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
+        converged = (
+            step_px < CONVERGED_PIXELS and step_m < CONVERGED_METRES and not bad.any() and bool(np.array_equal(judged, weight))
+        )  # fmt: skip
+        weight, released, images = judged, released | bad, images.release(bad)
+
+    final = linearise(images, rays, theta, ground, ground)
+    pixels = residuals(final, weight, theta) * rays.sigma
+    used = weight > 0.0
+    rms = float(np.sqrt(np.mean(pixels[used] ** 2))) if used.any() else 0.0
+    return Adjustment(
+        theta, ground, used, statistic, released, image_statistic, rms, converged, iteration + ROBUST_ITERATIONS
+    )  # fmt: skip
+
+
+def _step(images: ImageSet, rays: Rays, theta: Array, ground: Array, weight: Array) -> tuple[LinearRays, ImageEstimate, Array]:
+    """One Gauss-Newton step: the linearised rays, the images' new estimate, and by how much the ground moves (n, 3)."""
+    linear = linearise(images, rays, theta, ground, ground)
+    estimate = estimate_images(eliminate(linear, weight, len(images)), images.prior, images.parameters)
+    moved = ground_corrections(point_factors(linear, weight), linear, estimate.theta)
+    return linear, estimate, moved
+
+
+def _linked(estimate: ImageEstimate, linear: LinearRays, images: int) -> NDArray[np.bool_]:
+    """Images (m, m) that share a point."""
+    point = np.repeat(np.arange(len(linear.first) - 1), np.diff(linear.first))
+    sees = np.zeros((images, len(linear.first) - 1), dtype=np.float32)
+    sees[linear.image, point] = 1.0
+    return np.asarray(sees @ sees.T > 0.0)

@@ -1,0 +1,201 @@
+"""Blunders: robust weights to begin with, then Baarda's test of every ray, and of every image against its a priori model.
+
+With whitened observations the residuals of a point's rays are ``v = P (y - A theta)``, ``P = I - QQ'`` (see `submin.adjustment.elimination`), of covariance
+``P - P A M A' P`` when ``theta`` has covariance M. The test statistic of one coordinate is ``w = v / sqrt(its variance)``, standard normal without
+blunders (Baarda 1968; docs/mathematics.md, "Quality assurance").
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from submin.adjustment.elimination import Array, Index, LinearRays, Offsets, _gather, _most_rays, _orthonormal
+
+CRITICAL_RAY = 4.0
+"""A ray whose w exceeds this is a blunder (1 good coordinate in 16,000; decision 004 says why not 3.29)."""
+CRITICAL_IMAGE = 3.29
+"""An image whose correction exceeds this many of its standard deviations has a bad camera (1 good parameter in 1,000)."""
+TESTABLE = 0.01
+"""A coordinate or parameter is tested when at least this part of its a priori variance is checked by other observations."""
+ROBUST_SCALE = 2.4
+"""Residual, in sigmas, at which a ray's weight has fallen to one half of the Cauchy weight's way (95 % efficiency for normal errors)."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _residuals(
+    first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, theta: Array
+) -> tuple[Array, Array]:
+    """Residuals (r, 2) of the accepted rays, in sigmas, and their variances (r, 2) for known theta; NaN for the others."""
+    p = by_parameters.shape[2]
+    residual, variance = np.full(y.shape, np.nan), np.full(y.shape, np.nan)
+    most = _most_rays(first)
+    rays, root = np.empty(most, np.int64), np.empty(most)
+    b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
+    r, pivot = np.empty((3, 3)), np.empty(3, np.int32)
+    for j in range(len(first) - 1):
+        n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+        if n == 0:
+            continue
+        rank = _orthonormal(b, 2 * n, q, r, pivot)
+        for a in range(n):
+            i = rays[a]
+            for c in range(2):
+                for u in range(p):
+                    t[2 * a + c] -= root[a] * by_parameters[i, c, u] * theta[image[i], u]
+        for e in range(rank):
+            dot = 0.0
+            for i in range(2 * n):
+                dot += q[i, e] * t[i]
+            for i in range(2 * n):
+                t[i] -= dot * q[i, e]
+        for a in range(n):
+            i = rays[a]
+            for c in range(2):
+                residual[i, c] = t[2 * a + c] / root[a]
+                variance[i, c] = 1.0
+                for e in range(rank):
+                    variance[i, c] -= q[2 * a + c, e] ** 2
+    return residual, variance
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _snoop(
+    first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array,
+    theta: Array, covariance: Array, critical: float, testable: float, statistic: Array,
+) -> None:  # fmt: skip
+    """Test each point's rays, reject the worst, and again until none is left to reject. Changes ``weight``; ``statistic`` (r,) is each ray's last w."""
+    p = by_parameters.shape[2]
+    most = _most_rays(first)
+    rays, root = np.empty(most, np.int64), np.empty(most)
+    b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
+    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
+    row = np.empty(most * p)
+    for j in range(len(first) - 1):
+        while True:
+            n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+            if n < 2:
+                break
+            rank = _orthonormal(b, 2 * n, q, r, pivot)
+            if 2 * n <= rank:
+                break
+            for a in range(n):
+                i = rays[a]
+                for c in range(2):
+                    for u in range(p):
+                        t[2 * a + c] -= by_parameters[i, c, u] * theta[image[i], u]
+                for u in range(p):
+                    for e in range(rank):
+                        z[a, e, u] = q[2 * a, e] * by_parameters[i, 0, u] + q[2 * a + 1, e] * by_parameters[i, 1, u]
+            for e in range(rank):
+                dot = 0.0
+                for i in range(2 * n):
+                    dot += q[i, e] * t[i]
+                for i in range(2 * n):
+                    t[i] -= dot * q[i, e]
+            worst, worst_w = -1, 0.0
+            for a in range(n):
+                statistic[rays[a]] = 0.0
+                for c in range(2):
+                    free = 1.0
+                    for e in range(rank):
+                        free -= q[2 * a + c, e] ** 2
+                    if free < testable:
+                        continue
+                    for s in range(n):
+                        for u in range(p):
+                            value = by_parameters[rays[s], c, u] if s == a else 0.0
+                            for e in range(rank):
+                                value -= q[2 * a + c, e] * z[s, e, u]
+                            row[s * p + u] = value
+                    variance = free
+                    for s in range(n):
+                        at = image[rays[s]] * p
+                        for u in range(p):
+                            total = 0.0
+                            for s2 in range(n):
+                                to = image[rays[s2]] * p
+                                for v in range(p):
+                                    total += covariance[at + u, to + v] * row[s2 * p + v]
+                            variance -= row[s * p + u] * total
+                    if variance < testable * testable:
+                        continue
+                    w = abs(t[2 * a + c]) / np.sqrt(variance)
+                    statistic[rays[a]] = max(statistic[rays[a]], w)
+                    if w > worst_w:
+                        worst, worst_w = a, w
+            if not worst_w > critical:
+                break
+            if n == 2:  # two rays cannot be told apart: the point goes
+                weight[rays[0]] = 0.0
+                weight[rays[1]] = 0.0
+                statistic[rays[1 - worst]] = worst_w
+            weight[rays[worst]] = 0.0
+
+
+def robust_weights(linear: LinearRays, weight: Array, theta: Array) -> Array:
+    """Cauchy weights (r,) of rays from their residuals at these image corrections (m, p); rejected rays (weight 0) stay rejected."""
+    residual, variance = _residuals(
+        linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta
+    )  # fmt: skip
+    free = variance.sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        distance2 = np.where(free > TESTABLE, (residual**2).sum(axis=1) / free, 0.0)
+    return np.where(weight > 0.0, 1.0 / (1.0 + distance2 / ROBUST_SCALE**2), 0.0)
+
+
+def residuals(linear: LinearRays, weight: Array, theta: Array) -> Array:
+    """Residuals (r, 2) of accepted rays in sigmas at these image corrections (m, p), each point at its best place; NaN for rejected rays."""
+    return np.asarray(
+        _residuals(linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta)[0]
+    )
+
+
+def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance: Array) -> tuple[Array, Array]:
+    """Weights (r,) of the rays, 0 for blunders, and the test statistic (r,) of each, at an adjustment of the images.
+
+    Parameters
+    ----------
+    weight : (r,) 1 for rays to be tested, 0 for rays rejected before
+    theta, covariance : (m, p), (m p, m p), corrections of the images and their a posteriori covariance, both triangles
+
+    Notes
+    -----
+    Each point is judged by itself: its worst ray goes first and the rest are tested again. Of two rays that contradict each other both go.
+    """
+    judged, statistic = weight.copy(), np.zeros(len(weight))
+    _snoop(
+        linear.first, linear.image, judged, linear.by_ground, linear.by_parameters, linear.y,
+        theta, covariance, CRITICAL_RAY, TESTABLE, statistic,
+    )  # fmt: skip
+    return judged, statistic
+
+
+def image_statistics(theta: Array, covariance: Array, prior_variance: Array) -> Array:
+    """Test statistic (m, p) of each image's correction against its a priori model: ``theta / sqrt(Q - M)``, 0 where it cannot be tested.
+
+    Parameters
+    ----------
+    theta : (m, p) estimated corrections; covariance : (m p, m p), a posteriori; prior_variance : (m, p), diagonal of Q
+    """
+    free = prior_variance - np.diag(covariance).reshape(theta.shape)
+    testable = free > TESTABLE * prior_variance
+    return np.where(testable, np.abs(theta) / np.sqrt(np.where(testable, free, 1.0)), 0.0)
+
+
+def bad_cameras(statistics: Array, linked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Images (m,) whose camera is to be released now: above the critical value and the worst among the images that they share points with.
+
+    One bad camera makes its neighbours look bad, so only the worst of a neighbourhood is named before the images are adjusted again.
+
+    Parameters
+    ----------
+    statistics : (m, p), see `image_statistics`; linked : (m, m), True where two images share a point
+    """
+    worst = statistics.max(axis=1, initial=0.0)
+    suspects = np.flatnonzero(worst > CRITICAL_IMAGE)
+    bad = np.zeros(len(worst), dtype=bool)
+    for i in suspects:
+        bad[i] = worst[i] >= worst[suspects][linked[i, suspects]].max(initial=0.0)
+    return bad

@@ -1,0 +1,305 @@
+"""Elimination of ground points from their rays, orthogonally, and what is left for the images.
+
+A point's whitened, linearised rays are ``y = A theta + B (x - x0) + v``, ``Cov v = I`` (all its rays stacked). With an orthonormal basis Q of the
+columns of B, ``B = Q R``:
+
+    information left about the images   G = A'(I - QQ')A,  h = A'(I - QQ')y,  f = y'(I - QQ')y
+    own part of the point               D = (R'R)^-1,  U = -R^-1 Q'A,  xbar = x0 + R^-1 Q'y
+
+so that, given an estimate of the images, ``x = xbar + U theta`` and ``P_ij = delta_ij D_j + U_i M U_j'`` (docs/mathematics.md, "Sources"). Q spans every
+direction above round-off; a weak direction is never dropped, because that would keep information that is not there. A single ray leaves G = 0:
+the point is pending.
+
+Only the lower triangle of the images' information is written.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from submin.adjustment.images import ImageSet
+from submin.adjustment.rays import Rays
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+Offsets = NDArray[np.int64]
+
+ROUND_OFF = 1e-13
+"""A direction of B below this part of the largest one is round-off."""
+
+
+@dataclass(frozen=True)
+class LinearRays:
+    """Rays linearised at one state of images and ground, divided by their sigmas.
+
+    Attributes
+    ----------
+    first : (n + 1,) offsets of each point's rays
+    image : (r,) row of each ray's image
+    by_ground : (r, 2, 3) B, per metre
+    by_parameters : (r, 2, p) A, per unit of each parameter
+    y : (r, 2) reduced observations, ``(observed - f(theta*, x*) + A* theta* + B* (x* - x0)) / sigma``
+    """
+
+    first: Offsets
+    image: Index
+    by_ground: Array
+    by_parameters: Array
+    y: Array
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Information that rays hold about m images of p parameters: the state of a cell. Sums over disjoint points add.
+
+    Attributes
+    ----------
+    information : (m p, m p), lower triangle of ``sum G_j``
+    vector : (m p,) ``sum h_j``
+    misclosure : ``sum f_j``
+    redundancy : number of observations less the number of ground coordinates that they determine
+    """
+
+    information: Array
+    vector: Array
+    misclosure: float
+    redundancy: int
+
+
+@dataclass(frozen=True)
+class PointFactors:
+    """Own part and loadings of ground points.
+
+    Attributes
+    ----------
+    rank : (n,) directions of the point that its rays determine; 3 for a determined point
+    offset : (n, 3) ``xbar - x0``, metres (0 where rank < 3)
+    own : (n, 3, 3) D, square metres (NaN where rank < 3)
+    loading : (r, 3, p) U by ray: metres per unit of the ray's image's parameters (0 for rejected rays and where rank < 3)
+    """
+
+    rank: NDArray[np.int64]
+    offset: Array
+    own: Array
+    loading: Array
+
+
+def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, origin: Array) -> LinearRays:
+    """Linearise rays at image corrections ``theta`` (m, p) and ground ``linearised_at`` (n, 3), about the fixed ``origin`` (n, 3) of each point."""
+    ground = images.ground(linearised_at)
+    projection = images.project(theta, ground, rays.image, rays.point)
+    y = rays.observed - projection.image
+    y += np.einsum("rcp,rp->rc", projection.by_parameters, theta[rays.image])
+    y += np.einsum("rck,rk->rc", projection.by_ground, (linearised_at - origin)[rays.point])
+    y /= rays.sigma
+    return LinearRays(
+        rays.first(len(origin)),
+        rays.image,
+        projection.by_ground / rays.sigma[:, :, None],
+        projection.by_parameters / rays.sigma[:, :, None],
+        y,
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _orthonormal(b: Array, k: int, q: Array, r: Array, pivot: Index) -> int:
+    """Pivoted Gram-Schmidt, each step done twice, of the first k rows of b (k, 3): q (k, 3), r (3, 3) upper, columns in order ``pivot``. Returns the rank."""
+    for c in range(3):
+        pivot[c] = c
+        for i in range(k):
+            q[i, c] = b[i, c]
+        for d in range(3):
+            r[c, d] = 0.0
+    largest = 0.0
+    for c in range(3):
+        best, best_norm = c, -1.0
+        for d in range(c, 3):
+            norm = 0.0
+            for i in range(k):
+                norm += q[i, d] * q[i, d]
+            if norm > best_norm:
+                best, best_norm = d, norm
+        if best != c:
+            pivot[c], pivot[best] = pivot[best], pivot[c]
+            for i in range(k):
+                q[i, c], q[i, best] = q[i, best], q[i, c]
+            for i in range(c):
+                r[i, c], r[i, best] = r[i, best], r[i, c]
+        for e in range(c):  # second pass against the directions already found
+            dot = 0.0
+            for i in range(k):
+                dot += q[i, e] * q[i, c]
+            r[e, c] += dot
+            for i in range(k):
+                q[i, c] -= dot * q[i, e]
+        norm = 0.0
+        for i in range(k):
+            norm += q[i, c] * q[i, c]
+        norm = np.sqrt(norm)
+        if c == 0:
+            largest = norm
+        if not norm > ROUND_OFF * largest:
+            return c
+        r[c, c] = norm
+        for i in range(k):
+            q[i, c] /= norm
+        for d in range(c + 1, 3):
+            dot = 0.0
+            for i in range(k):
+                dot += q[i, c] * q[i, d]
+            r[c, d] = dot
+            for i in range(k):
+                q[i, d] -= dot * q[i, c]
+    return 3
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _gather(j: int, first: Offsets, weight: Array, by_ground: Array, y: Array, rays: Offsets, root: Array, b: Array, t: Array) -> int:
+    """Collect the accepted rays of point j: their rows, square roots of weights, stacked B and y. Returns their number."""
+    n = 0
+    for i in range(first[j], first[j + 1]):
+        if weight[i] > 0.0:
+            rays[n], root[n] = i, np.sqrt(weight[i])
+            for c in range(2):
+                t[2 * n + c] = root[n] * y[i, c]
+                for d in range(3):
+                    b[2 * n + c, d] = root[n] * by_ground[i, c, d]
+            n += 1
+    return n
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _most_rays(first: Offsets) -> int:
+    most = 1
+    for j in range(len(first) - 1):
+        most = max(most, first[j + 1] - first[j])
+    return most
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _eliminate(
+    first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, information: Array, vector: Array
+) -> tuple[float, int]:
+    p = by_parameters.shape[2]
+    most = _most_rays(first)
+    rays, root = np.empty(most, np.int64), np.empty(most)
+    b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
+    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
+    misclosure, redundancy = 0.0, 0
+    for j in range(len(first) - 1):
+        n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+        if n == 0:
+            continue
+        rank = _orthonormal(b, 2 * n, q, r, pivot)
+        if 2 * n <= rank:
+            continue
+        redundancy += 2 * n - rank
+        for e in range(rank):
+            dot = 0.0
+            for i in range(2 * n):
+                dot += q[i, e] * t[i]
+            for i in range(2 * n):
+                t[i] -= dot * q[i, e]
+        for i in range(2 * n):
+            misclosure += t[i] * t[i]
+        for a in range(n):
+            i = rays[a]
+            at = image[i] * p
+            for u in range(p):
+                a0, a1 = root[a] * by_parameters[i, 0, u], root[a] * by_parameters[i, 1, u]
+                vector[at + u] += a0 * t[2 * a] + a1 * t[2 * a + 1]
+                for e in range(rank):
+                    z[a, e, u] = q[2 * a, e] * a0 + q[2 * a + 1, e] * a1
+                for v in range(u + 1):
+                    information[at + u, at + v] += root[a] * (a0 * by_parameters[i, 0, v] + a1 * by_parameters[i, 1, v])
+        for a in range(n):
+            at = image[rays[a]] * p
+            for c in range(n):
+                to = image[rays[c]] * p
+                if to > at:
+                    continue
+                for u in range(p):
+                    for v in range(u + 1 if to == at else p):
+                        total = 0.0
+                        for e in range(rank):
+                            total += z[a, e, u] * z[c, e, v]
+                        information[at + u, to + v] -= total
+    return misclosure, redundancy
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _point_factors(
+    first: Offsets, weight: Array, by_ground: Array, by_parameters: Array, y: Array
+) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    points, p = len(first) - 1, by_parameters.shape[2]
+    rank_of = np.zeros(points, np.int64)
+    offset, own = np.zeros((points, 3)), np.full((points, 3, 3), np.nan)
+    loading = np.zeros((len(by_ground), 3, p))
+    most = _most_rays(first)
+    rays, root = np.empty(most, np.int64), np.empty(most)
+    b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
+    r, pivot = np.empty((3, 3)), np.empty(3, np.int32)
+    inverse = np.empty((3, 3))
+    for j in range(points):
+        n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+        if n == 0:
+            continue
+        rank_of[j] = _orthonormal(b, 2 * n, q, r, pivot)
+        if rank_of[j] < 3:
+            continue
+        # rows of ``inverse`` are those of R^-1, put back into the order of the coordinates
+        for c in range(3):
+            for d in range(3):
+                inverse[c, d] = 0.0
+        for c in range(3):
+            inverse[pivot[c], c] = 1.0 / r[c, c]
+        inverse[pivot[1], 2] = -r[1, 2] / (r[1, 1] * r[2, 2])
+        inverse[pivot[0], 1] = -r[0, 1] / (r[0, 0] * r[1, 1])
+        inverse[pivot[0], 2] = (r[0, 1] * r[1, 2] / r[1, 1] - r[0, 2]) / (r[0, 0] * r[2, 2])
+        for e in range(3):
+            dot = 0.0
+            for i in range(2 * n):
+                dot += q[i, e] * t[i]
+            for c in range(3):
+                offset[j, c] += inverse[c, e] * dot
+        for c in range(3):
+            for d in range(3):
+                own[j, c, d] = inverse[c, 0] * inverse[d, 0] + inverse[c, 1] * inverse[d, 1] + inverse[c, 2] * inverse[d, 2]
+        for a in range(n):
+            i = rays[a]
+            for u in range(p):
+                a0, a1 = root[a] * by_parameters[i, 0, u], root[a] * by_parameters[i, 1, u]
+                for e in range(3):
+                    z = q[2 * a, e] * a0 + q[2 * a + 1, e] * a1
+                    for c in range(3):
+                        loading[i, c, u] -= inverse[c, e] * z
+    return rank_of, offset, own, loading
+
+
+def eliminate(linear: LinearRays, weight: Array, images: int) -> Sums:
+    """Sum the information that rays, each with a weight (r,) (0: rejected, 1: accepted), hold about ``images`` images."""
+    size = images * linear.by_parameters.shape[2]
+    information, vector = np.zeros((size, size)), np.zeros(size)
+    misclosure, redundancy = _eliminate(
+        linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, information, vector
+    )
+    return Sums(information, vector, float(misclosure), int(redundancy))
+
+
+def point_factors(linear: LinearRays, weight: Array) -> PointFactors:
+    """Own parts and loadings of points from their accepted rays (weight (r,) above 0)."""
+    return PointFactors(*_point_factors(linear.first, weight, linear.by_ground, linear.by_parameters, linear.y))
+
+
+def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) -> Array:
+    """Estimated ``x - x0`` (n, 3) in metres, given the images' corrections (m, p); 0 for points that are not determined."""
+    by_ray = np.einsum("rcp,rp->rc", factors.loading, theta[linear.image])
+    corrections = factors.offset.copy()
+    seen = linear.first[1:] > linear.first[:-1]
+    if seen.any():
+        corrections[seen] += np.add.reduceat(by_ray, linear.first[:-1][seen], axis=0)
+    return corrections

@@ -1,0 +1,84 @@
+"""From summed information and an a priori model to the images' corrections and their covariance: one Cholesky factorisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from submin.adjustment.elimination import Sums
+from submin.errors import NumericalError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ImageEstimate:
+    """A posteriori image parameters.
+
+    Attributes
+    ----------
+    theta : (m, p) corrections
+    covariance : (m p, m p) their covariance M, both triangles
+    chi_square : weighted sum of squares of residuals, a priori model included
+    """
+
+    theta: Array
+    covariance: Array
+    chi_square: float
+
+
+def fill_symmetric(lower: Array) -> Array:
+    """The full symmetric matrix of a lower triangle, in place."""
+    upper = np.triu_indices(len(lower), 1)
+    lower[upper] = lower.T[upper]
+    return lower
+
+
+def reduced_information(information: Array, prior: sp.csr_array) -> Array:
+    """``I + K' S K`` (q, q), for summed information S (lower triangle) and a priori factor K."""
+    full = fill_symmetric(information.copy())
+    half = prior.T @ full
+    total = np.asarray((prior.T @ np.ascontiguousarray(half.T)).T)
+    total[np.diag_indices(len(total))] += 1.0
+    return total
+
+
+def cholesky(matrix: Array) -> Array:
+    """Lower Cholesky factor, in place (Fortran order, upper triangle undefined); `NumericalError` when not positive definite."""
+    factor, info = la.lapack.dpotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
+    if info != 0:
+        raise NumericalError(
+            f"the information matrix ({len(matrix)} parameters) is not positive definite at row {info - 1}; a sum of cells is damaged"
+        )
+    return np.asarray(factor)
+
+
+def estimate_images(sums: Sums, prior: sp.csr_array, parameters: int) -> ImageEstimate:
+    """Estimate the images from their summed information and a priori factor.
+
+    ``Lambda = I + K' S K``, ``u = Lambda^-1 K' h``, ``theta = K u``, ``M = K Lambda^-1 K'``.
+
+    Raises
+    ------
+    NumericalError
+        When the information is not positive definite, which sound sums never are.
+    """
+    factor = cholesky(reduced_information(sums.information, prior))
+    right = prior.T @ sums.vector
+    u, _ = la.lapack.dpotrs(factor, right, lower=1)
+    inverse, info = la.lapack.dpotri(factor, lower=1, overwrite_c=1)
+    if info != 0:
+        raise NumericalError(f"the information matrix ({len(factor)} parameters) cannot be inverted")
+    covariance = prior @ (prior @ fill_symmetric(np.asarray(inverse))).T
+    theta = np.asarray(prior @ u).reshape(-1, parameters)
+    # f + |u|^2 at the minimum equals f - h'theta
+    return ImageEstimate(theta, np.asarray(covariance), float(sums.misclosure - sums.vector @ theta.ravel()))
+
+
+def prior_variance(prior: sp.csr_array, parameters: int) -> Array:
+    """Diagonal of ``K K'`` as (m, p)."""
+    return np.asarray(prior.multiply(prior).sum(axis=1)).reshape(-1, parameters)

@@ -1,0 +1,97 @@
+"""A set of images to be adjusted together: packed cameras of any sensors, and what is believed of them a priori."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from submin.adjustment.priors import ImagePrior, prior_factor
+from submin.geodesy import WGS84, Ellipsoid
+from submin.sensors import Ground, Projection, sensor_named
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """Images with their cameras and a priori model.
+
+    Attributes
+    ----------
+    ids : names of the m images
+    sensors : name of each image's sensor model
+    cameras : (m, c) packed cameras; rows of sensors with fewer numbers are padded with NaN
+    priors : what the a priori factor needs, by image
+    ellipsoid : of the body that they look at
+    """
+
+    ids: tuple[str, ...]
+    sensors: tuple[str, ...]
+    cameras: Array
+    priors: tuple[ImagePrior, ...]
+    ellipsoid: Ellipsoid = WGS84
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def parameters(self) -> int:
+        """Adjustable parameters per image: those of the widest sensor in the set."""
+        return max((sensor_named(name).parameters for name in set(self.sensors)), default=0)
+
+    @property
+    def prior(self) -> sp.csr_array:
+        """A priori factor K (m p, q), see `prior_factor`."""
+        return prior_factor(self.priors, self.parameters)
+
+    def take(self, rows: Sequence[int] | NDArray[np.integer]) -> ImageSet:
+        """The images of these rows, in this order."""
+        return ImageSet(
+            tuple(self.ids[i] for i in rows),
+            tuple(self.sensors[i] for i in rows),
+            self.cameras[np.asarray(rows, dtype=np.int64)],
+            tuple(self.priors[i] for i in rows),
+            self.ellipsoid,
+        )
+
+    def release(self, which: NDArray[np.bool_]) -> ImageSet:
+        """The same images with the priors of some (m,) released: their positions are left to the network."""
+        return replace(
+            self, priors=tuple(replace(p, released=p.released or bool(w)) for p, w in zip(self.priors, which, strict=True))
+        )
+
+    def ground(self, geocentric: Array) -> Ground:
+        """Ground points (n, 3) in metres in the forms that sensors need."""
+        return Ground.at(geocentric, self.ellipsoid)
+
+    def project(self, parameters: Array, ground: Ground, image: Index, point: Index) -> Projection:
+        """Image coordinates of rays and their partials; see `submin.sensors.Sensor.project`."""
+        names = set(self.sensors)
+        if len(names) == 1:
+            return sensor_named(next(iter(names))).project(self.cameras, parameters, ground, image, point)
+        out = Projection(
+            np.empty((len(image), 2)), np.empty((len(image), 2, 3)), np.zeros((len(image), 2, self.parameters))
+        )  # fmt: skip
+        of_image = np.array(self.sensors)
+        for name in names:
+            sensor, rays = sensor_named(name), of_image[image] == name
+            part = sensor.project(self.cameras, parameters, ground, image[rays], point[rays])
+            out.image[rays], out.by_ground[rays] = part.image, part.by_ground
+            out.by_parameters[rays, :, : sensor.parameters] = part.by_parameters
+        return out
+
+    def localise(self, image: Index, observed: Array) -> Array:
+        """Geodetic coordinates (r, 3) of image coordinates (r, 2) at each camera's mean height, unadjusted cameras."""
+        ground = np.full((len(image), 3), np.nan)
+        of_image = np.array(self.sensors)
+        for name in set(self.sensors):
+            sensor, rays = sensor_named(name), of_image[image] == name
+            heights = sensor.mean_height(self.cameras)[image[rays]]
+            samples, lines = np.ascontiguousarray(observed[rays, 0]), np.ascontiguousarray(observed[rays, 1])
+            ground[rays] = sensor.localise(self.cameras, image[rays], samples, lines, heights)
+        return ground

@@ -1,0 +1,58 @@
+"""Rays: measured image coordinates of ground points, the raw material of every network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Measured rays, sorted by point.
+
+    Attributes
+    ----------
+    point : (r,) row of the ground point that each ray sees, not decreasing
+    image : (r,) row of the image in which it was measured
+    observed : (r, 2) sample and line, pixels
+    sigma : (r, 2) standard deviations of sample and line, pixels
+    accepted : (r,) False for a ray that was rejected as a blunder
+    """
+
+    point: Index
+    image: Index
+    observed: Array
+    sigma: Array
+    accepted: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def first(self, points: int) -> NDArray[np.int64]:
+        """Offsets (points + 1,) of each point's rays."""
+        return np.searchsorted(self.point, np.arange(points + 1)).astype(np.int64)
+
+    def with_accepted(self, accepted: NDArray[np.bool_]) -> Rays:
+        """The same rays with other decisions about blunders."""
+        return replace(self, accepted=accepted)
+
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Rays:
+        """The rays of these rows, which must keep the order by point."""
+        return Rays(self.point[rows], self.image[rows], self.observed[rows], self.sigma[rows], self.accepted[rows])
+
+
+def sorted_rays(point: Index, image: Index, observed: Array, sigma: Array, accepted: NDArray[np.bool_]) -> Rays:
+    """Rays in canonical order: by point, then image. The order of arrival leaves no trace in later sums."""
+    order = np.lexsort((observed[:, 1], observed[:, 0], image, point))
+    return Rays(
+        np.ascontiguousarray(point[order], dtype=np.int32),
+        np.ascontiguousarray(image[order], dtype=np.int32),
+        np.ascontiguousarray(observed[order], dtype=np.float64),
+        np.ascontiguousarray(sigma[order], dtype=np.float64),
+        np.ascontiguousarray(accepted[order], dtype=np.bool_),
+    )

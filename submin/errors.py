@@ -1,0 +1,33 @@
+"""What can go wrong, as a tree that callers can catch."""
+
+
+class SubminError(Exception):
+    """Base of every error that submin raises on purpose."""
+
+
+class InputError(SubminError):
+    """Input that cannot be used as it is: the message names the file, the place, the value, and what was expected."""
+
+
+class CatalogueError(InputError):
+    """A catalogue that does not keep its contract (columns, types, unknown images, frame)."""
+
+
+class StoreError(SubminError):
+    """A network store that cannot be opened, read or written."""
+
+
+class ConflictError(StoreError):
+    """Another coordinator committed to the network while this one was at work."""
+
+
+class BlockRejected(SubminError):
+    """One block cannot be fused; the others can. The message is the reason kept in the ledger."""
+
+
+class NumericalError(SubminError):
+    """A computation without a trustworthy result (a matrix that is not positive definite, no convergence)."""
+
+
+class QueryError(InputError):
+    """A query that cannot be answered as asked (unknown policy, tile, version or point)."""

@@ -1,0 +1,89 @@
+"""What every sensor model answers: where a ground point falls in an image, and how that depends on point and image parameters.
+
+A sensor works on many rays of many images at once: cameras are rows of one array, rays name a camera row and a ground row. A new
+sensor is one file with one object that keeps this protocol, and one row in ``submin.sensors.SENSORS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_jacobian
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Ground points in the forms that sensor models need.
+
+    Attributes
+    ----------
+    geocentric : (n, 3), metres
+    geodetic : (n, 3), longitude and latitude in degrees, height in metres above the ellipsoid
+    jacobian : (n, 3, 3), partials of ``geodetic`` with respect to ``geocentric``
+    """
+
+    geocentric: Array
+    geodetic: Array
+    jacobian: Array
+
+    @classmethod
+    def at(cls, geocentric: Array, ellipsoid: Ellipsoid = WGS84) -> Ground:
+        """Ground points from geocentric coordinates (n, 3) in metres."""
+        geodetic = geocentric_to_geodetic(geocentric, ellipsoid)
+        return cls(np.ascontiguousarray(geocentric), geodetic, geodetic_jacobian(geodetic, ellipsoid))
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Image coordinates of rays and their partials.
+
+    Attributes
+    ----------
+    image : (r, 2), predicted sample and line in pixels
+    by_ground : (r, 2, 3), partials with respect to the geocentric coordinates of the point, pixels per metre
+    by_parameters : (r, 2, p), partials with respect to the adjustable parameters of the image, pixels per unit
+    """
+
+    image: Array
+    by_ground: Array
+    by_parameters: Array
+
+
+class Sensor(Protocol):
+    """A sensor model. ``name`` is the word in the column ``sensor`` of a catalogue."""
+
+    name: str
+    parameters: int
+    """Number of adjustable parameters of an image."""
+    bias: tuple[int, int]
+    """Places of the two parameters that shift the whole image in sample and line: the ones that images of a pass can share."""
+
+    def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
+        """Row of numbers that describes one camera, from its catalogue description; raises `InputError` when it is incomplete."""
+        ...
+
+    def project(self, cameras: Array, parameters: Array, ground: Ground, image: Index, point: Index) -> Projection:
+        """Project ray r: point ``point[r]`` into image ``image[r]``.
+
+        ``cameras`` (m, c) holds packed cameras, ``parameters`` (m, p) the corrections of the images' adjustable parameters.
+        """
+        ...
+
+    def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array) -> Array:
+        """Longitude, latitude (degrees) and height (r, 3) of image coordinates at given ellipsoidal heights, unadjusted cameras.
+
+        A place that cannot be reached (camera looking away from it) comes back as NaN.
+        """
+        ...
+
+    def mean_height(self, cameras: Array) -> Array:
+        """Height (m,) in metres near which each camera's ground is expected."""
+        ...

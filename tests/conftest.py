@@ -1,0 +1,22 @@
+"""Fixtures that every kind of test shares."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Folder of the real data; without it the test is skipped visibly, and in CI it fails."""
+    folder = Path(os.environ.get("SUBMIN_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        message = f"real data not found in {folder}: set SUBMIN_DATA to their folder"
+        if os.environ.get("CI"):
+            pytest.fail(message)
+        pytest.skip(message)
+    return folder
