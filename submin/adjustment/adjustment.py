@@ -39,7 +39,7 @@ class Adjustment:
     statistic : (r,) test statistic of each ray when it was last judged
     released : (m,) True for images whose a priori model was released because their camera is bad
     image_statistic : (m,) largest test statistic of each image against its a priori model, when it was judged bad, else the last one
-    ray_rms_px : root mean square of the accepted rays' residuals per coordinate, pixels
+    residuals : (r, 2) of the accepted rays, in sigmas, each point at its best place; NaN for rejected rays
     converged : False when the iterations ran out
     iterations : how many there were
     """
@@ -50,7 +50,7 @@ class Adjustment:
     statistic: Array
     released: NDArray[np.bool_]
     image_statistic: Array
-    ray_rms_px: float
+    residuals: Array
     converged: bool
     iterations: int
 
@@ -87,19 +87,18 @@ def adjust(images: ImageSet, rays: Rays, start: Array) -> Adjustment:
             linear, candidates if iteration <= FREE_DECISIONS else weight, theta, estimate.covariance
         )  # fmt: skip
         worst = image_statistics(theta, estimate.covariance, prior_variance(images.prior, images.parameters))
-        bad = bad_cameras(worst, _linked(estimate, linear, len(images))) & ~released
+        bad = bad_cameras(worst, linear) & ~released
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
         converged = (
             step_px < CONVERGED_PIXELS and step_m < CONVERGED_METRES and not bad.any() and bool(np.array_equal(judged, weight))
         )  # fmt: skip
-        weight, released, images = judged, released | bad, images.release(bad)
+        weight, released = judged, released | bad
+        images = images.release(bad) if bad.any() else images
 
     final = linearise(images, rays, theta, ground, ground)
-    pixels = residuals(final, weight, theta) * rays.sigma
-    used = weight > 0.0
-    rms = float(np.sqrt(np.mean(pixels[used] ** 2))) if used.any() else 0.0
     return Adjustment(
-        theta, ground, used, statistic, released, image_statistic, rms, converged, iteration + ROBUST_ITERATIONS
+        theta, ground, weight > 0.0, statistic, released, image_statistic, residuals(final, weight, theta), converged,
+        iteration + ROBUST_ITERATIONS,
     )  # fmt: skip
 
 
@@ -110,10 +109,3 @@ def _step(images: ImageSet, rays: Rays, theta: Array, ground: Array, weight: Arr
     moved = ground_corrections(point_factors(linear, weight), linear, estimate.theta)
     return linear, estimate, moved
 
-
-def _linked(estimate: ImageEstimate, linear: LinearRays, images: int) -> NDArray[np.bool_]:
-    """Images (m, m) that share a point."""
-    point = np.repeat(np.arange(len(linear.first) - 1), np.diff(linear.first))
-    sees = np.zeros((images, len(linear.first) - 1), dtype=np.float32)
-    sees[linear.image, point] = 1.0
-    return np.asarray(sees @ sees.T > 0.0)

@@ -184,18 +184,27 @@ def image_statistics(theta: Array, covariance: Array, prior_variance: Array) -> 
     return np.where(testable, np.abs(theta) / np.sqrt(np.where(testable, free, 1.0)), 0.0)
 
 
-def bad_cameras(statistics: Array, linked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def bad_cameras(statistics: Array, linear: LinearRays) -> NDArray[np.bool_]:
     """Images (m,) whose camera is to be released now: above the critical value and the worst among the images that they share points with.
 
     One bad camera makes its neighbours look bad, so only the worst of a neighbourhood is named before the images are adjusted again.
 
     Parameters
     ----------
-    statistics : (m, p), see `image_statistics`; linked : (m, m), True where two images share a point
+    statistics : (m, p), see `image_statistics`; linear : the rays, for which images share points
     """
     worst = statistics.max(axis=1, initial=0.0)
     suspects = np.flatnonzero(worst > CRITICAL_IMAGE)
     bad = np.zeros(len(worst), dtype=bool)
-    for i in suspects:
-        bad[i] = worst[i] >= worst[suspects][linked[i, suspects]].max(initial=0.0)
+    if not len(suspects):
+        return bad
+    points = len(linear.first) - 1
+    place = np.full(len(worst), -1)
+    place[suspects] = np.arange(len(suspects))
+    chosen = place[linear.image] >= 0
+    sees = np.zeros((len(suspects), points), dtype=bool)
+    sees[place[linear.image[chosen]], np.repeat(np.arange(points), np.diff(linear.first))[chosen]] = True
+    for k, i in enumerate(suspects):
+        linked = (sees & sees[k]).any(axis=1)
+        bad[i] = worst[i] >= worst[suspects][linked].max()
     return bad

@@ -303,3 +303,10 @@ def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) 
     if seen.any():
         corrections[seen] += np.add.reduceat(by_ray, linear.first[:-1][seen], axis=0)
     return corrections
+
+
+def residuals_of(linear: LinearRays, theta: Array, correction: Array) -> Array:
+    """Linear residuals (r, 2) in sigmas of all rays at image corrections (m, p) and ground corrections ``x - x0`` (n, 3)."""
+    point = np.repeat(np.arange(len(correction)), np.diff(linear.first))
+    residual = linear.y - np.einsum("rcp,rp->rc", linear.by_parameters, theta[linear.image])
+    return np.asarray(residual - np.einsum("rck,rk->rc", linear.by_ground, correction[point]))

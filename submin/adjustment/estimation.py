@@ -31,10 +31,17 @@ class ImageEstimate:
     chi_square: float
 
 
+MIRROR_BLOCK = 256
+
+
 def fill_symmetric(lower: Array) -> Array:
-    """The full symmetric matrix of a lower triangle, in place."""
-    upper = np.triu_indices(len(lower), 1)
-    lower[upper] = lower.T[upper]
+    """The full symmetric matrix of a lower triangle, in place, block by block (a whole transpose would miss the cache)."""
+    size = len(lower)
+    for start in range(0, size, MIRROR_BLOCK):
+        stop = min(start + MIRROR_BLOCK, size)
+        square = lower[start:stop, start:stop]
+        square += np.tril(square, -1).T - np.triu(square, 1)
+        lower[start:stop, stop:] = lower[stop:, start:stop].T
     return lower
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -44,7 +45,7 @@ class ImageSet:
         """Adjustable parameters per image: those of the widest sensor in the set."""
         return max((sensor_named(name).parameters for name in set(self.sensors)), default=0)
 
-    @property
+    @cached_property
     def prior(self) -> sp.csr_array:
         """A priori factor K (m p, q), see `prior_factor`."""
         return prior_factor(self.priors, self.parameters)

@@ -37,6 +37,9 @@ _COEFFICIENTS = 10
 _CENTRE_SAMPLE, _CENTRE_LINE, _HALF_WIDTH, _HALF_HEIGHT = range(90, 94)
 PACKED = 94
 
+LOCALISED_PIXELS = 1e-6
+"""Far below any measurement, and far above the spacing of longitudes in float64 (a few 1e-9 pixels)."""
+
 
 @numba.njit(cache=True, error_model="numpy")
 def _ratio(num: Array, den: Array, lon: float, lat: float, h: float, out: Array) -> None:
@@ -127,7 +130,7 @@ def _localise(cameras: Array, image: Index, samples: Array, lines: Array, height
         for _ in range(30):
             _raw(camera, g, sample, line)
             es, el = samples[r] - sample[0], lines[r] - line[0]
-            if abs(es) < 1e-9 * (1.0 + abs(samples[r])) and abs(el) < 1e-9 * (1.0 + abs(lines[r])):
+            if abs(es) < LOCALISED_PIXELS and abs(el) < LOCALISED_PIXELS:
                 converged = True
                 break
             determinant = sample[1] * line[2] - sample[2] * line[1]

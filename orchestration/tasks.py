@@ -1,0 +1,248 @@
+"""What workers do: pure functions of their arguments and of one version of the network, safe to run again after a loss.
+
+They live in an importable module, so that Dask sends their names and not their code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import icechunk
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from submin.adjustment.adjustment import Adjustment, adjust
+from submin.adjustment.elimination import Sums
+from submin.adjustment.images import ImageSet
+from submin.adjustment.intersection import intersect
+from submin.adjustment.rays import sorted_rays
+from submin.errors import SubminError
+from submin.geodesy import Ellipsoid
+from submin.network.cell import Cell, NewRays, bundle, second_order, summed, union_of_images, with_rays, without_points
+from submin.network.cell import SECOND_ORDER_PIXELS
+from submin.network.network_image import NetworkImage, image_set
+from submin.network.sub_min import add_sums, factor
+from submin.storage.network_store import Snapshot
+from submin.storage.schema import write_cell, write_sub_min
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+MIN_MEASURED_POINTS = 1
+
+
+@dataclass(frozen=True)
+class BlockRays:
+    """A block as stage 1 sees it: its images, and its rays by point id and image."""
+
+    block_id: str
+    images: tuple[NetworkImage, ...]
+    point_ids: NDArray[np.str_]
+    image: NDArray[np.int32]
+    observed: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class BlockAdjustment:
+    """Stage 1 of one block: which rays (in the block's order) are accepted, or why the whole block is not."""
+
+    block_id: str
+    accepted: Flags
+    reason: str | None
+
+
+@dataclass(frozen=True)
+class FlaggedImage:
+    """An image whose camera was found to be bad."""
+
+    row: int
+    image_id: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class CellReport:
+    """Counts of a cell after a batch: accepted and rejected rays by image row, and the sum of squared residuals in pixels."""
+
+    images: NDArray[np.int32]
+    used: NDArray[np.int64]
+    rejected: NDArray[np.int64]
+    square_px: float
+
+
+@dataclass(frozen=True)
+class TileUpdate:
+    """What a tile's update leaves: the sums of the own cells that changed, reports of all own cells, and the writes."""
+
+    tile: int
+    sums: dict[int, tuple[NDArray[np.int32], Sums]]
+    report: TileReport
+
+
+@dataclass(frozen=True)
+class TileReport:
+    """The part of a tile's update that the coordinator keeps."""
+
+    tile: int
+    changed: tuple[int, ...]
+    cells: dict[int, CellReport]
+    flagged: tuple[FlaggedImage, ...]
+    converged: bool
+    writes: icechunk.ForkSession
+
+
+@dataclass(frozen=True)
+class TileFactored:
+    """A tile's sub-MIN has been written."""
+
+    tile: int
+    images: int
+    writes: icechunk.ForkSession
+
+
+def adjust_blocks(blocks: Sequence[BlockRays], ellipsoid: Ellipsoid) -> list[BlockAdjustment]:
+    """Stage 1: adjust each block by itself, free of the network, reject its blunders; a block that fails gets its reason."""
+    return [adjust_block(block, ellipsoid) for block in blocks]
+
+
+def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
+    """Stage 1 of one block."""
+    accepted = np.ones(len(block.image), dtype=np.bool_)
+    try:
+        images = image_set(block.images, ellipsoid)
+        ids, point = np.unique(block.point_ids, return_inverse=True)
+        order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
+        rays = sorted_rays(point.astype(np.int32), block.image, block.observed, block.sigma, accepted)
+        start = intersect(images, rays, len(ids))
+        lost = ~np.isfinite(start.geocentric).all(axis=1)
+        if lost.any():
+            image = block.images[int(rays.image[rays.first(len(ids))[:-1][lost][0]])].image_id
+            return BlockAdjustment(
+                block.block_id, accepted,
+                f"image {image}: its camera does not reach the ground at point {ids[lost][0]}; check the camera model and the axis order",
+            )  # fmt: skip
+        if np.bincount(rays.point).max() < 2:
+            return BlockAdjustment(block.block_id, accepted, None)
+        result = adjust(images, rays, start.geocentric)
+        if not result.converged:
+            return BlockAdjustment(
+                block.block_id, accepted,
+                f"the adjustment of the block did not converge in {result.iterations} iterations; check its cameras and measurements",
+            )  # fmt: skip
+        accepted[order] = result.accepted
+        return BlockAdjustment(block.block_id, accepted, None)
+    except SubminError as error:
+        return BlockAdjustment(block.block_id, accepted, str(error))
+
+
+def update_tile(
+    writes: icechunk.ForkSession,
+    tile: int,
+    arrivals: Mapping[int, NewRays],
+    departures: Mapping[int, NDArray[np.str_]],
+    new_images: Sequence[NetworkImage],
+) -> TileUpdate:
+    """Judge the rays that a tile holds, and sum its own cells.
+
+    All rays that the tile holds are adjusted together (they include the neighbours' rays in shared cells); the tile decides only for the points of its
+    own core. An own cell is summed again when its rays, decisions or linearisation changed.
+    """
+    root = zarr.open_group(writes.store, mode="r+")
+    snapshot = Snapshot(root, "network")
+    cells = {}
+    for number in snapshot.cover.cells_held(tile):
+        cell = snapshot.cell(number)
+        if number in departures:
+            cell = without_points(cell, departures[number])
+        if number in arrivals:
+            cell = with_rays(cell, arrivals[number])
+        cells[number] = cell
+    held = [cell for cell in cells.values() if len(cell)]
+    rows = union_of_images(held)
+    images = image_set(_images(snapshot, rows, new_images), snapshot.metadata.ellipsoid)
+    rays, _ = bundle(held, rows)
+    # every ray is judged afresh, also one rejected on less evidence: decisions follow from the rays, not from their order of arrival
+    rays = rays.with_accepted(np.ones(len(rays), dtype=np.bool_))
+    result = adjust(images, rays, np.concatenate([cell.linearised_at for cell in held]))
+
+    sums: dict[int, tuple[NDArray[np.int32], Sums]] = {}
+    reports: dict[int, CellReport] = {}
+    ray_at = np.cumsum([0, *(len(cell.rays) for cell in held)])
+    point_at = np.cumsum([0, *(len(cell) for cell in held)])
+    squares = np.nansum((result.residuals * rays.sigma) ** 2, axis=1)
+    for k, cell in enumerate(held):
+        if snapshot.cover.owner(cell.number) != tile:
+            continue
+        own_rays, own_points = slice(ray_at[k], ray_at[k + 1]), slice(point_at[k], point_at[k + 1])
+        own_images = np.searchsorted(rows, cell.images)
+        accepted, theta, ground = result.accepted[own_rays], result.theta[own_images], result.ground[own_points]
+        changed = cell.number in arrivals or cell.number in departures or not np.array_equal(accepted, cell.rays.accepted)
+        judged = replace(cell, rays=cell.rays.with_accepted(accepted))
+        if changed or second_order(judged, images.take(own_images), theta, ground) > SECOND_ORDER_PIXELS:
+            new = summed(replace(judged, theta=theta, linearised_at=ground), images.take(own_images))
+            write_cell(root, snapshot.cover.cell_name(cell.number), new)
+            sums[cell.number] = (new.images, new.sums)
+        reports[cell.number] = _report(judged, float(squares[own_rays].sum()))
+    flagged = _flagged(result, images, rows)
+    return TileUpdate(tile, sums, TileReport(tile, tuple(sums), reports, flagged, result.converged, writes))
+
+
+def report_of(update: TileUpdate) -> TileReport:
+    """The part of an update that goes back to the coordinator; the sums stay with the workers."""
+    return update.report
+
+
+def factor_tile(
+    writes: icechunk.ForkSession, tile: int, updates: Sequence[TileUpdate], new_images: Sequence[NetworkImage], released: Sequence[int]
+) -> TileFactored:
+    """One factorisation: the tile's sub-MIN from the sums of all cells that it holds, new ones from the updates, the others from the store."""
+    root = zarr.open_group(writes.store, mode="r+")
+    snapshot = Snapshot(root, "network")
+    fresh = {number: sums for update in updates for number, sums in update.sums.items()}
+    parts = []
+    cells = []
+    for number in snapshot.cover.cells_held(tile):
+        if number in fresh:
+            part = fresh[number]
+        else:
+            cell = snapshot.cell(number)
+            part = (cell.images, cell.sums)
+        if len(part[0]):
+            parts.append(part)
+            cells.append(number)
+    rows = np.unique(np.concatenate([part[0] for part in parts])).astype(np.int32)
+    gone = set(released)
+    images = [replace(image, released=image.released or int(row) in gone) for row, image in zip(rows, _images(snapshot, rows, new_images), strict=True)]
+    sub_min = factor(add_sums(parts, rows, snapshot.metadata.parameters), rows, image_set(images, snapshot.metadata.ellipsoid))
+    write_sub_min(root, snapshot.cover.tile_name(tile), sub_min, cells)
+    return TileFactored(tile, len(rows), writes)
+
+
+def _images(snapshot: Snapshot, rows: NDArray[np.int32], new: Sequence[NetworkImage]) -> list[NetworkImage]:
+    """Images of these rows (ascending): those in the store, then those of the batch."""
+    base = snapshot.image_count()
+    known = rows[rows < base]
+    return [*snapshot.images(known), *(new[int(row) - base] for row in rows[rows >= base])]
+
+
+def _report(cell: Cell, square_px: float) -> CellReport:
+    rays, m = cell.rays, len(cell.images)
+    used = np.bincount(rays.image[rays.accepted], minlength=m)
+    return CellReport(cell.images, used, np.bincount(rays.image, minlength=m) - used, square_px)
+
+
+def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> tuple[FlaggedImage, ...]:
+    names = ("sample bias", "sample drift along samples", "sample drift along lines", "line bias", "line drift along samples", "line drift along lines")
+    flagged = []
+    for k in np.flatnonzero(result.released):
+        model = images.priors[k].a_priori
+        sigma = np.where(np.isin(np.arange(images.parameters), images.priors[k].bias), model.bias_px, model.drift_px)
+        worst = int(np.argmax(np.abs(result.theta[k]) / sigma))
+        flagged.append(FlaggedImage(
+            int(rows[k]), images.ids[k],
+            f"{names[worst]} of the camera is {result.theta[k, worst]:.1f} px where its a priori sigma is {sigma[worst]:g} px "
+            f"(test statistic {result.image_statistic[k]:.1f}); its prior is no longer used",
+        ))  # fmt: skip
+    return tuple(flagged)

@@ -1,0 +1,377 @@
+"""Import of images with RPCs and measured tie points into a catalogue.
+
+Three inputs: a table of images, a folder of RPC files, and tracks, a row a ray: ``track_id, image_id, col, row`` in the pixel frame of the image's RPC.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from submin.adjustment.priors import APriori
+from submin.errors import CatalogueError, InputError
+from submin.formats.rpc_files import read_rpc
+from submin.sensors import sensor_named
+from submin.storage.catalogue import integer, number, read_table, text
+from submin.storage.catalogue_schema import (
+    DEFAULT_SIGMA_PX,
+    Array,
+    Block,
+    CatalogueMetadata,
+    Ids,
+    ImageRecord,
+    Index,
+    first_repeated,
+    parse_utc,
+    utc_text,
+)
+from submin.storage.catalogue_writer import CatalogueWriter
+
+PASS_GAP_SECONDS = 180.0
+"""Images of one platform further apart in time than this are of two passes."""
+
+_A_PRIORI = APriori()
+
+BLOCKINGS = ("pass", "image", "all")
+
+_IMAGES = (
+    text("image_id"), text("acquisition_utc", False, blank=True), integer("width", False), integer("height", False),
+    number("col0", False), number("row0", False), text("rpc", False, blank=True), text("platform", False, blank=True),
+    text("pass_id", False, blank=True), text("licence", False, blank=True),
+)  # fmt: skip
+_TRACKS = (text("track_id"), text("image_id"), number("col"), number("row"))
+
+
+@dataclass(frozen=True)
+class ImportSummary:
+    """What an import has written: sizes, and notes on what was assumed or left out.
+
+    Attributes
+    ----------
+    catalogue : folder
+    dataset : name of the catalogue, prefix of its point ids
+    blocks, passes, images, points, rays : numbers of them
+    notes : one line each
+    """
+
+    catalogue: Path
+    dataset: str
+    blocks: int
+    passes: int
+    images: int
+    points: int
+    rays: int
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """A row of the table of images; None for what it does not say."""
+
+    row: int
+    image_id: str
+    time: datetime | None
+    width: int | None
+    height: int | None
+    origin: tuple[float, float]
+    rpc: str
+    platform: str
+    pass_id: str
+    licence: str
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """Rays (r,): track, index of the image in the table of images, and image coordinates in the RPC's pixel frame."""
+
+    track_ids: Ids
+    image: Index
+    col: Array
+    row: Array
+
+    def extent(self, images: int) -> tuple[Array, Array]:
+        """Least and greatest col and row (images, 2) in each image; not finite in one without rays."""
+        low, high = np.full((images, 2), np.inf), np.full((images, 2), -np.inf)
+        for k, values in enumerate((self.col, self.row)):
+            np.minimum.at(low[:, k], self.image, values)
+            np.maximum.at(high[:, k], self.image, values)
+        return low, high
+
+
+def import_rpc(
+    images_csv: str | Path,
+    rpc_folder: str | Path,
+    tracks_csv: str | Path,
+    out: str | Path,
+    blocks: Literal["pass", "image", "all"] = "pass",
+    dataset: str | None = None,
+    shared_ids: bool = False,
+    a_priori: APriori = _A_PRIORI,
+    overwrite: bool = False,
+) -> ImportSummary:
+    """Write a catalogue of images with RPCs and their tie points.
+
+    Parameters
+    ----------
+    images_csv
+        Table with ``image_id`` and, where known, ``acquisition_utc`` (20141005160138 or ISO 8601), ``width``, ``height`` (pixels; else the
+        extent of the tracks), ``col0``, ``row0`` (first pixel of the image in the RPC's pixel frame; else 0, 0), ``rpc`` (file name; else
+        ``IMAGE_ID.json``), ``platform``, ``pass_id``, ``licence``.
+    rpc_folder
+        Folder of the RPC files, see `submin.formats.rpc_files.read_rpc`.
+    tracks_csv
+        Table with ``track_id``, ``image_id``, ``col``, ``row`` in the RPC's own pixel frame.
+    out
+        Folder of the catalogue.
+    blocks
+        What is adjusted together: the images of a ``pass``, every ``image`` by itself, or ``all``.
+    dataset
+        Name of the catalogue; else that of the folder of ``images_csv``. Point ids are ``DATASET/track_id``.
+    shared_ids
+        Leave point ids as the tracks have them: the same id in another catalogue is the same ground point.
+    a_priori
+        What is believed of the cameras.
+    overwrite
+        Take the place of a catalogue in ``out``.
+
+    Raises
+    ------
+    InputError
+        When a table or an RPC cannot be used: file, row, value, what was expected. Nothing is written then.
+    """
+    if blocks not in BLOCKINGS:
+        raise CatalogueError(f"blocks is {blocks!r}; expected one of {', '.join(BLOCKINGS)}")
+    images_file = Path(images_csv)
+    name = dataset or images_file.resolve().parent.name
+    writer = CatalogueWriter(out, CatalogueMetadata(name), overwrite)
+    listed = _read_images(images_file)
+    tracks = _read_tracks(Path(tracks_csv), images_file, listed)
+
+    notes: list[str] = []
+    seen = np.bincount(tracks.image, minlength=len(listed)) > 0
+    if not seen.all():
+        notes.append(f"left out, because no track names them: {_named(i.image_id for i, s in zip(listed, seen, strict=True) if not s)}")
+    kept = [i for i, s in zip(listed, seen, strict=True) if s]
+    image_of = (np.cumsum(seen) - 1).astype(np.int32)
+    tracks = replace(tracks, image=image_of[tracks.image])
+
+    pass_ids = _pass_ids(kept, name, notes)
+    block_ids = {"pass": pass_ids, "image": [i.image_id for i in kept], "all": [name] * len(kept)}[blocks]
+    records = _records(images_file, Path(rpc_folder), kept, pass_ids, block_ids, tracks, notes)
+    prefix = "" if shared_ids else f"{name}/"
+    members = _members(records)
+    with writer:
+        writer.write_images(records[i] for rows in members.values() for i in rows)
+        writer.write_priors(a_priori)
+        for block in _blocks(members, records, tracks, prefix, a_priori):
+            writer.write_block(block)
+    return ImportSummary(
+        catalogue=Path(out),
+        dataset=name,
+        blocks=len(members),
+        passes=len(set(pass_ids)),
+        images=len(records),
+        points=len(np.unique(tracks.track_ids)),
+        rays=len(tracks.image),
+        notes=tuple(notes),
+    )
+
+
+def _read_images(path: Path) -> list[_Listed]:
+    table = read_table(path, _IMAGES)
+    if not table.num_rows:
+        raise CatalogueError(f"{path}: holds no images; expected at least one row")
+    columns = {c.name: table[c.name].to_pylist() if c.name in table.schema.names else [None] * table.num_rows for c in _IMAGES}
+    listed: list[_Listed] = []
+    first_row: dict[str, int] = {}
+    for row, values in enumerate(zip(*columns.values(), strict=True), start=1):
+        entry = dict(zip(columns, values, strict=True))
+        image_id = entry["image_id"]
+        if image_id in first_row:
+            raise CatalogueError(f"{path}: row {row}: image_id {image_id!r} is that of row {first_row[image_id]} too; expected it once")
+        first_row[image_id] = row
+        listed.append(_listed(path, row, entry))
+    return listed
+
+
+def _listed(path: Path, row: int, entry: Mapping[str, Any]) -> _Listed:
+    for name in ("width", "height"):
+        if entry[name] is not None and entry[name] <= 0:
+            raise CatalogueError(f"{path}: row {row}: {name} is {entry[name]}; expected a positive number of pixels")
+    origin = (entry["col0"] or 0.0, entry["row0"] or 0.0)
+    if not np.isfinite(origin).all():
+        raise CatalogueError(f"{path}: row {row}: col0, row0 are {origin[0]}, {origin[1]}; expected finite numbers of pixels")
+    try:
+        time = parse_utc(entry["acquisition_utc"]) if entry["acquisition_utc"] else None
+    except InputError as error:
+        raise CatalogueError(f"{path}: row {row}: acquisition_utc: {error}") from None
+    texts = {name: entry[name] or "" for name in ("rpc", "platform", "pass_id", "licence")}
+    return _Listed(row, entry["image_id"], time, entry["width"], entry["height"], origin, **texts)
+
+
+def _read_tracks(path: Path, images_file: Path, listed: Sequence[_Listed]) -> _Tracks:
+    table = read_table(path, _TRACKS)
+    if not table.num_rows:
+        raise CatalogueError(f"{path}: holds no tracks; expected at least one row")
+    image_ids = pa.array([image.image_id for image in listed], pa.string())
+    index = pc.index_in(table["image_id"], value_set=image_ids)
+    if index.null_count:
+        k = int(np.argmax(pc.is_null(index).to_numpy()))
+        raise CatalogueError(f"{path}: row {k + 1}: image_id is {table['image_id'][k].as_py()!r}; expected an image of {images_file}")
+    col, row = (np.asarray(pc.fill_null(table[name], np.nan).to_numpy(), dtype=np.float64) for name in ("col", "row"))
+    for name, values in (("col", col), ("row", row)):
+        if not np.isfinite(values).all():
+            k = int(np.argmin(np.isfinite(values)))
+            raise CatalogueError(f"{path}: row {k + 1}: {name} is {table[name][k].as_py()!r}; expected a finite number of pixels")
+    image = np.asarray(index.to_numpy(), dtype=np.int32)
+    track_ids = np.asarray(table["track_id"].to_numpy(), dtype=np.str_)
+    repeated = first_repeated(np.unique(track_ids, return_inverse=True)[1], image)
+    if repeated is not None:
+        earlier, k = repeated
+        raise CatalogueError(
+            f"{path}: row {k + 1}: track {str(track_ids[k])!r} is in image {listed[image[k]].image_id!r} as in row {earlier + 1}; expected one ray"
+        )
+    return _Tracks(track_ids, image, col, row)
+
+
+def _pass_ids(listed: Sequence[_Listed], dataset: str, notes: list[str]) -> list[str]:
+    """Pass of each image: as the table says, else by gaps in time within a platform, else one for all images without a time."""
+    pass_ids = [image.pass_id for image in listed]
+    timed = [(image.platform, image.time, i) for i, image in enumerate(listed) if image.time and not image.pass_id]
+    last: tuple[str, datetime] | None = None
+    for platform, time, i in sorted(timed):
+        if last is None or last[0] != platform or (time - last[1]).total_seconds() > PASS_GAP_SECONDS:
+            current = f"{platform or dataset}-{time:%Y%m%dT%H%M%S}"
+        pass_ids[i], last = current, (platform, time)
+    untimed = [i for i, image in enumerate(listed) if not image.time and not image.pass_id]
+    if untimed:
+        for i in untimed:
+            pass_ids[i] = f"{dataset}-pass"
+        notes.append(
+            f"neither pass_id nor acquisition_utc is known of {len(untimed)} images of {len(listed)}: they are taken as one pass, {dataset}-pass"
+        )
+    return pass_ids
+
+
+def _records(
+    images_file: Path,
+    rpc_folder: Path,
+    listed: Sequence[_Listed],
+    pass_ids: Sequence[str],
+    block_ids: Sequence[str],
+    tracks: _Tracks,
+    notes: list[str],
+) -> list[ImageRecord]:
+    """Rows of the catalogue's table of images."""
+    low, high = tracks.extent(len(listed))
+    records: list[ImageRecord] = []
+    guessed, outside = list[str](), list[str]()
+    for i, image in enumerate(listed):
+        first = np.array(image.origin)
+        # The pixel that holds the outermost track is the last one.
+        held = np.floor(high[i] - first + 0.5).astype(int) + 1
+        width, height = image.width or int(held[0]), image.height or int(held[1])
+        if image.width is None or image.height is None:
+            guessed.append(image.image_id)
+        if width <= 0 or height <= 0:
+            raise CatalogueError(
+                f"{images_file}: row {image.row}: size of image {image.image_id} is not given, and its tracks end at col {high[i, 0]:g}, "
+                f"row {high[i, 1]:g}, before its first pixel {image.origin}; expected width, height, or col0, row0 in the tracks' frame"
+            )
+        if (low[i] < first - 1.0).any() or (high[i] > first + np.array([width, height])).any():
+            outside.append(image.image_id)
+        camera = read_rpc(_rpc_path(images_file, rpc_folder, image)) | {"origin": list(image.origin)}
+        acquired = utc_text(image.time) if image.time else ""
+        records.append(
+            ImageRecord(
+                image.image_id, block_ids[i], pass_ids[i], image.platform, "rpc", json.dumps(camera), width, height, acquired,
+                licence=image.licence,
+            )
+        )  # fmt: skip
+    if guessed:
+        notes.append(f"width or height is not known; the extent of the tracks stands for it: {_named(guessed)}")
+    if outside:
+        notes.append(f"some tracks lie outside the image, so check col0, row0, width, height: {_named(outside)}")
+    footprints = _footprints(records)
+    if b"" in footprints:
+        notes.append(
+            f"no footprint, because the RPC cannot be inverted: {_named(r.image_id for r, f in zip(records, footprints, strict=True) if not f)}"
+        )
+    return [replace(record, footprint=footprint) for record, footprint in zip(records, footprints, strict=True)]
+
+
+def _rpc_path(images_file: Path, rpc_folder: Path, image: _Listed) -> Path:
+    name = Path(image.rpc or f"{image.image_id}.json")
+    tried = list(dict.fromkeys((rpc_folder / name, rpc_folder / name.name)))
+    for path in tried:
+        if path.is_file():
+            return path
+    raise CatalogueError(f"{images_file}: row {image.row}: no RPC of image {image.image_id!r}; expected {' or '.join(map(str, tried))}")
+
+
+def _footprints(records: Sequence[ImageRecord]) -> list[bytes]:
+    """Polygons (WKB, degrees) of the images' outer pixel edges on the ground at each camera's mean height; empty where there is no ground."""
+    sensor = sensor_named("rpc")
+    cameras = np.stack([record.pack() for record in records])
+    first = np.array([json.loads(record.camera)["origin"] for record in records])
+    size = np.array([(record.width, record.height) for record in records], dtype=np.float64)
+    corners = first[:, None] - 0.5 + size[:, None] * np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    image = np.repeat(np.arange(len(records), dtype=np.int32), 4)
+    heights = sensor.mean_height(cameras)[image]
+    samples, lines = corners[..., 0].ravel(), corners[..., 1].ravel()
+    ground = sensor.localise(cameras, image, samples, lines, heights)[:, :2].reshape(-1, 4, 2)
+    reached = np.asarray(np.isfinite(ground).all(axis=(1, 2)))
+    polygons = iter(shapely.to_wkb(shapely.polygons(ground[reached])))
+    return [next(polygons) if r else b"" for r in reached]
+
+
+def _members(records: Sequence[ImageRecord]) -> dict[str, list[int]]:
+    """Images of each block, blocks and images in order of time; those without a time last."""
+    never = datetime.max.replace(tzinfo=UTC)
+    times = [parse_utc(record.acquired) if record.acquired else never for record in records]
+    members: dict[str, list[int]] = {}
+    for i in sorted(range(len(records)), key=lambda i: (times[i], i)):
+        members.setdefault(records[i].block_id, []).append(i)
+    return members
+
+
+def _blocks(
+    members: Mapping[str, Sequence[int]], records: Sequence[ImageRecord], tracks: _Tracks, prefix: str, a_priori: APriori
+) -> list[Block]:
+    """Blocks with their rays, in the order of the tracks."""
+    block_of, index_in_block = np.empty(len(records), dtype=np.int64), np.empty(len(records), dtype=np.int32)
+    for k, rows in enumerate(members.values()):
+        block_of[rows], index_in_block[rows] = k, np.arange(len(rows))
+    of_ray = block_of[tracks.image]
+    order = np.argsort(of_ray, kind="stable")
+    bounds = np.searchsorted(of_ray[order], np.arange(len(members) + 1))
+    point_ids = np.char.add(prefix, tracks.track_ids)
+    blocks: list[Block] = []
+    for k, (block_id, rows) in enumerate(members.items()):
+        rays = order[bounds[k] : bounds[k + 1]]
+        sigma = np.full(len(rays), DEFAULT_SIGMA_PX)
+        blocks.append(
+            Block(
+                block_id, tuple(records[i] for i in rows), a_priori, point_ids[rays], index_in_block[tracks.image[rays]],
+                tracks.col[rays], tracks.row[rays], sigma, sigma,
+            )
+        )  # fmt: skip
+    return blocks
+
+
+def _named(ids: Iterable[str]) -> str:
+    """The first few of some ids, and how many more."""
+    names = list(ids)
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+__all__ = ["PASS_GAP_SECONDS", "ImportSummary", "import_rpc"]

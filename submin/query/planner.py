@@ -1,0 +1,247 @@
+"""From a question to an answer: which points, which tiles, which policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+from submin.errors import QueryError
+from submin.geodesy import geocentric_to_geodetic
+from submin.network.cell import Cell, factors
+from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate
+from submin.query import covariance_intersection, rigorous, tile
+from submin.query.source import Index, NetworkSource
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+Policy = Callable[[NetworkSource, Sequence[int], Index, Sequence[GroundPart]], SubMin]
+POLICIES: dict[str, Policy] = {
+    "tile": tile.estimate,
+    "ci": covariance_intersection.estimate,
+    "rigorous": rigorous.estimate,
+}
+"""Merge policies. A new one is one file, one line here and one row in the table of `tests/property/test_policies.py`."""
+
+SEARCH_MARGIN_METRES = 2000.0
+"""Points are looked for in cells this far around the queried area: a point's estimate may lie outside the cell of its registration."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Points of one cell: rows of the cell, ascending."""
+
+    cell: Cell
+    rows: Rows
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer of a query, in arrays.
+
+    Attributes
+    ----------
+    ids : (n,) points, ascending; geocentric : (n, 3) metres; covariance : (3n, 3n) joint, geocentric square metres
+    owner : (n,) tile whose core holds each point; rays : (n,) accepted rays of each
+    policy : the one used; tiles : those concerned; images : rows of the images behind the answer
+    network_wide : True when it equals the answer of the monolithic network
+    """
+
+    ids: NDArray[np.str_]
+    geocentric: Array
+    covariance: Array
+    owner: Rows
+    rays: Rows
+    policy: str
+    tiles: tuple[int, ...]
+    images: Index
+    network_wide: bool
+
+
+def points_in_area(source: NetworkSource, area: BaseGeometry) -> list[Selection]:
+    """Determined points whose latest position lies in an area (longitude and latitude, degrees)."""
+    near = set(cells_near(source, area))
+    selections = []
+    for number in source.cell_numbers():
+        if number not in near:
+            continue
+        cell = source.cell(number)
+        at = geocentric_to_geodetic(cell.linearised_at, source.cover.ellipsoid)
+        inside = np.asarray(shapely.intersects_xy(area, at[:, 0], at[:, 1]), dtype=bool)
+        selections.append(Selection(cell, np.flatnonzero(inside & _determined(cell))))
+    return [s for s in selections if len(s.rows)]
+
+
+def points_of_tile(source: NetworkSource, number: int) -> list[Selection]:
+    """All determined points that a tile holds."""
+    existing = set(source.cell_numbers())
+    cells = [source.cell(cell) for cell in source.cover.cells_held(number) if cell in existing]
+    return [s for s in (Selection(cell, np.flatnonzero(_determined(cell))) for cell in cells) if len(s.rows)]
+
+
+def points_named(source: NetworkSource, ids: NDArray[np.str_], cells: Rows) -> list[Selection]:
+    """Points by id, with the cell (n,) where the directory says that each is.
+
+    Raises
+    ------
+    QueryError
+        Naming the points that are not in the network, or whose rays do not determine them yet.
+    """
+    found = np.zeros(len(ids), dtype=bool)
+    selections = []
+    for number in np.unique(cells[cells >= 0]):
+        cell = source.cell(int(number))
+        wanted = np.flatnonzero(cells == number)
+        row = np.minimum(np.searchsorted(cell.point_ids, ids[wanted]), max(len(cell) - 1, 0))
+        held = (cell.point_ids[row] == ids[wanted]) & _determined(cell)[row] if len(cell) else np.zeros(len(wanted), dtype=bool)
+        found[wanted[held]] = True
+        selections.append(Selection(cell, np.unique(row[held])))
+    if not found.all():
+        missing = ids[~found]
+        raise QueryError(
+            f"{len(missing)} of {len(ids)} points are not in the network or not yet determined by two rays: "
+            f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+        )
+    return [s for s in selections if len(s.rows)]
+
+
+def cells_near(source: NetworkSource, area: BaseGeometry) -> list[int]:
+    """Cells with points in or near an area."""
+    cover = source.cover
+    outline = shapely.get_coordinates(shapely.segmentize(area, 0.25) if not area.is_empty else area)
+    if not len(outline):
+        return []
+    x, y = cover.plane(outline[:, 0], outline[:, 1])
+    west, south = x.min() - SEARCH_MARGIN_METRES, y.min() - SEARCH_MARGIN_METRES
+    east, north = x.max() + SEARCH_MARGIN_METRES, y.max() + SEARCH_MARGIN_METRES
+    near = []
+    for number in source.cell_numbers():
+        w, s, e, n = cover.core_bounds(cover.owner(number))
+        if w <= east and e >= west and s <= north and n >= south:
+            near.append(number)
+    return near
+
+
+def well_spread(selections: Sequence[Selection], most: int) -> list[Selection]:
+    """At most so many of the points: those with the most rays, one in each square of a grid fine enough."""
+    total = sum(len(s.rows) for s in selections)
+    if total <= most:
+        return list(selections)
+    at = np.concatenate([s.cell.linearised_at[s.rows] for s in selections])
+    rays = np.concatenate([_ray_counts(s.cell)[s.rows] for s in selections])
+    ids = np.concatenate([s.cell.point_ids[s.rows] for s in selections])
+    order = np.lexsort((ids, -rays))
+    low, high = 0.0, float(np.ptp(at, axis=0).max()) + 1.0
+    chosen = order[:1]
+    for _ in range(40):  # bisection for the finest grid that has no more occupied squares than points wanted
+        side = 0.5 * (low + high)
+        square = np.floor((at[order] - at.min(axis=0)) / side).astype(np.int64)
+        _, first = np.unique(square, axis=0, return_index=True)
+        if len(first) <= most:
+            chosen, high = order[first], side
+        else:
+            low = side
+    starts = np.cumsum([0, *(len(s.rows) for s in selections)])
+    kept = np.sort(chosen)
+    thinned = [
+        Selection(s.cell, s.rows[kept[(kept >= start) & (kept < start + len(s.rows))] - start])
+        for s, start in zip(selections, starts, strict=False)
+    ]
+    return [s for s in thinned if len(s.rows)]
+
+
+def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None = None) -> Answer:
+    """Answer for the selected points by a policy.
+
+    ``tile_number`` fixes the tile of policy ``tile``. Points whose rays determine no position are left out.
+
+    Raises
+    ------
+    QueryError
+        When the policy is unknown, or ``tile`` is asked of points that no one tile holds.
+    """
+    if policy != "auto" and policy not in POLICIES:
+        raise QueryError(f"policy is {policy!r}; expected one of auto, {', '.join(POLICIES)}")
+    kept: list[Selection] = []
+    parts: list[GroundPart] = []
+    for selection in selections:
+        kept_selection, part = _ground_part(source, selection)
+        if len(kept_selection.rows):
+            kept.append(kept_selection)
+            parts.append(part)
+    if not parts:
+        none = np.empty(0, dtype=np.int64)
+        return Answer(
+            np.empty(0, dtype="U1"), np.empty((0, 3)), np.empty((0, 0)), none, none, "tile" if policy == "auto" else policy, (),
+            np.empty(0, dtype=np.int32), True,
+        )  # fmt: skip
+    policy, tiles = _choose(source, kept, policy, tile_number)
+    images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
+    state = POLICIES[policy](source, tiles, images, parts)
+    held = {cell for t in tiles for cell in source.cover.cells_held(t)}
+    ids = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
+    order = np.argsort(ids, kind="stable")
+    axes = (3 * order[:, None] + np.arange(3)).ravel()  # sorted before the joint matrix is formed, which is never copied
+    loading = loadings(parts, state.images, state.theta.shape[1])[axes]
+    own = np.concatenate([part.factors.own for part in parts])[order]
+    return Answer(
+        ids[order],
+        np.concatenate([locate(part, state) for part in parts])[order],
+        joint_covariance(loading, own, state.covariance),
+        np.concatenate([np.full(len(s.rows), source.cover.owner(s.cell.number)) for s in kept])[order],
+        np.concatenate([_ray_counts(s.cell)[s.rows] for s in kept])[order],
+        policy, tuple(tiles), state.images,
+        policy != "ci" and held.issuperset(source.cell_numbers()),
+    )  # fmt: skip
+
+
+def _choose(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None) -> tuple[str, list[int]]:
+    """The policy to use and the tiles concerned."""
+    cover = source.cover
+    cells = [s.cell.number for s in selections]
+    if tile_number is not None:
+        if policy not in ("tile", "auto"):
+            raise QueryError(f"a tile is named, but policy {policy!r} merges several; use policy 'tile' or leave the tile out")
+        return "tile", [tile_number]
+    all_hold = set.intersection(*(set(cover.holders(cell)) for cell in cells))
+    if policy in ("tile", "auto") and all_hold:
+        at = np.concatenate([s.cell.linearised_at[s.rows] for s in selections])
+        geodetic = geocentric_to_geodetic(at, cover.ellipsoid)
+        depth = {t: float(cover.depth(t, geodetic[:, 0], geodetic[:, 1]).min()) for t in all_hold}
+        owned = np.bincount([cover.owner(s.cell.number) for s in selections], weights=[len(s.rows) for s in selections])
+        # the tile whose core holds most of the query; ties to the largest interior depth
+        best = max(sorted(all_hold), key=lambda t: (owned[t] if t < len(owned) else 0.0, depth[t]))
+        return "tile", [best]
+    if policy == "tile":
+        raise QueryError("no one tile holds all queried points; use policy 'rigorous' or 'auto', a smaller area, or name a tile")
+    return ("rigorous" if policy == "auto" else policy), sorted({t for cell in cells for t in cover.holders(cell)})
+
+
+def _ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection, GroundPart]:
+    """Own parts and loadings of the selected points; those of deficient rank are left out."""
+    cell = selection.cell
+    images = source.image_set(cell.images)
+    linear, point_factors = factors(cell, images, selection.rows)
+    good = point_factors.rank == 3
+    if not good.all():
+        return _ground_part(source, Selection(cell, selection.rows[good]))
+    rows = cell.images[linear.image]
+    part = GroundPart(
+        cell.origin[selection.rows],
+        type(linear)(linear.first, rows, linear.by_ground, linear.by_parameters, linear.y),
+        point_factors,
+    )
+    return selection, part
+
+
+def _ray_counts(cell: Cell) -> Rows:
+    return np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell))
+
+
+def _determined(cell: Cell) -> NDArray[np.bool_]:
+    return _ray_counts(cell) >= 2

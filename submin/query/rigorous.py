@@ -1,0 +1,21 @@
+"""Policy ``rigorous``: each cell of the tiles concerned once, and the a priori model of their images once.
+
+For all tiles this is the monolithic network (docs/mathematics.md, "Cells": rigorous merge).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from submin.network.sub_min import GroundPart, SubMin, add_sums, factor
+from submin.query.source import Index, NetworkSource, existing_cells
+
+
+def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: Sequence[GroundPart]) -> SubMin:
+    """A posteriori state of all images that the tiles see, from their distinct cells, each once."""
+    sums = [source.cell_sums(cell) for cell in existing_cells(source, tiles)]
+    rows = np.unique(np.concatenate([of_cell for of_cell, _ in sums])).astype(np.int32)
+    image_set = source.image_set(rows)
+    return factor(add_sums(sums, rows, image_set.parameters), rows, image_set)

@@ -1,0 +1,160 @@
+"""Records and growing tables as Zarr arrays (docs/decisions/002-store-layout.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import zarr
+from numpy.typing import NDArray
+
+AnyArray = NDArray[Any]
+
+REALS_CHUNK = 1 << 17
+TABLE_CHUNK = 1 << 16
+
+
+def encode_text(values: AnyArray) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """UTF-8 bytes of all texts, one after another, and the end of each."""
+    text = pa.array(values, type=pa.large_string())
+    _, offsets, data = text.buffers()
+    ends = np.frombuffer(offsets, dtype=np.int64)[1 : len(values) + 1] if len(values) else np.empty(0, dtype=np.int64)
+    return np.frombuffer(data, dtype=np.uint8)[: ends[-1]] if len(ends) else np.empty(0, dtype=np.uint8), ends
+
+
+def decode_text(data: NDArray[np.uint8], ends: NDArray[np.int64]) -> NDArray[np.str_]:
+    """Inverse of `encode_text`."""
+    if not len(ends):
+        return np.empty(0, dtype="U1")
+    offsets = np.concatenate([np.zeros(1, dtype=np.int64), ends])
+    buffers = [None, pa.py_buffer(offsets), pa.py_buffer(np.ascontiguousarray(data, dtype=np.uint8))]
+    return np.asarray(pa.Array.from_buffers(pa.large_string(), len(ends), buffers).to_numpy(zero_copy_only=False), dtype=np.str_)
+
+
+def write_record(parent: zarr.Group, name: str, parts: Mapping[str, AnyArray], attributes: Mapping[str, Any] | None = None) -> zarr.Group:
+    """Write a record of named arrays, replacing any record of that name. Booleans and integers become int64, floats float64."""
+    kinds: dict[str, list[AnyArray]] = {"reals": [], "integers": [], "bytes": []}
+    layout: list[list[Any]] = []
+
+    def put(part: str, kind: str, values: AnyArray) -> None:
+        start = sum(a.size for a in kinds[kind])
+        kinds[kind].append(values.ravel())
+        layout.append([part, kind, start, list(values.shape)])
+
+    for part, values in parts.items():
+        if values.dtype.kind == "U":
+            data, ends = encode_text(values)
+            put(part, "bytes", data)
+            put(part + ".ends", "integers", ends)
+        elif values.dtype.kind == "f":
+            put(part, "reals", values.astype(np.float64, copy=False))
+        else:
+            put(part, "integers", values.astype(np.int64, copy=False))
+    # attributes at creation: each later change of one costs as much as an array
+    group = parent.create_group(name, overwrite=True, attributes={"layout": layout, **(attributes or {})})
+    for kind, arrays in kinds.items():
+        if arrays:
+            data = np.concatenate(arrays)
+            if data.size:
+                options: dict[str, Any] = {"compressors": None} if kind == "reals" else {}
+                group.create_array(kind, data=data, chunks=(min(REALS_CHUNK, data.size),), **options)
+    return group
+
+
+def read_record(group: zarr.Group, wanted: Iterable[str] | None = None) -> dict[str, AnyArray]:
+    """Named arrays of a record: all, or only those wanted."""
+    names = None if wanted is None else set(wanted)
+    chosen = [entry for entry in group.attrs["layout"] if names is None or str(entry[0]).removesuffix(".ends") in names]
+    spans: dict[str, tuple[int, int]] = {}
+    for _, kind, start, shape in chosen:
+        stop = start + int(np.prod(shape))
+        low, high = spans.get(kind, (start, stop))
+        spans[kind] = (min(low, start), max(high, stop))
+    data = {kind: group[kind][low:high] if high > low else np.empty(0) for kind, (low, high) in spans.items()}
+    parts: dict[str, AnyArray] = {}
+    for part, kind, start, shape in chosen:
+        at = start - spans[kind][0]
+        parts[part] = data[kind][at : at + int(np.prod(shape))].reshape(shape)
+    for part in [p for p in parts if p.endswith(".ends")]:
+        ends = parts.pop(part)
+        parts[part.removesuffix(".ends")] = decode_text(parts[part.removesuffix(".ends")], ends.astype(np.int64))
+    return parts
+
+
+def create_table(parent: zarr.Group, name: str, columns: Mapping[str, str]) -> zarr.Group:
+    """An empty table; ``columns`` gives each column's type: a numpy name, or ``text``."""
+    group = parent.create_group(name)
+    for column, kind in columns.items():
+        if kind == "text":
+            group.create_array(column, shape=(0,), chunks=(1 << 20,), dtype="uint8")
+            group.create_array(column + ".ends", shape=(0,), chunks=(TABLE_CHUNK,), dtype="int64")
+        else:
+            group.create_array(column, shape=(0,), chunks=(TABLE_CHUNK,), dtype=kind)
+    group.attrs["columns"] = dict(columns)
+    return group
+
+
+def table_length(group: zarr.Group) -> int:
+    """Number of rows."""
+    column, kind = next(iter(group.attrs["columns"].items()))
+    return int(group[column + ".ends" if kind == "text" else column].shape[0])
+
+
+def append_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
+    """Append rows; every column of the table must be given."""
+    kinds = group.attrs["columns"]
+    if set(kinds) != set(columns):
+        raise ValueError(f"columns are {sorted(columns)}; expected {sorted(kinds)}")
+    for column, values in columns.items():
+        if not len(values):
+            continue
+        if kinds[column] == "text":
+            data, ends = encode_text(values)
+            base = group[column].shape[0]
+            if data.size:
+                group[column].append(data)
+            group[column + ".ends"].append(ends + base)
+        else:
+            group[column].append(values.astype(kinds[column]))
+
+
+def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: int = 0, stop: int | None = None) -> dict[str, AnyArray]:
+    """Columns of the rows from ``start`` to before ``stop``."""
+    kinds = group.attrs["columns"]
+    columns: dict[str, AnyArray] = {}
+    for column in kinds if wanted is None else wanted:
+        if kinds[column] != "text":
+            columns[column] = group[column][start:stop]
+            continue
+        ends = group[column + ".ends"][max(start - 1, 0) : stop]
+        base = int(ends[0]) if start > 0 and len(ends) else 0
+        ends = ends[1:] if start > 0 else ends
+        data = group[column][base : int(ends[-1])] if len(ends) else np.empty(0, dtype=np.uint8)
+        columns[column] = decode_text(data, ends - base)
+    return columns
+
+
+def set_rows(group: zarr.Group, column: str, rows: NDArray[np.int64], values: AnyArray) -> None:
+    """Change some rows of a column that is not text."""
+    if len(rows):
+        group[column].oindex[rows] = values
+
+
+_FNV_OFFSET, _FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
+
+
+def hash_ids(ids: NDArray[np.str_]) -> NDArray[np.uint64]:
+    """64-bit FNV-1a hash (n,) of the UTF-8 bytes of each id (Fowler, Noll, Vo)."""
+    if not len(ids):
+        return np.empty(0, dtype=np.uint64)
+    encoded = np.char.encode(ids, "utf-8")
+    width = max(encoded.dtype.itemsize, 1)
+    matrix = encoded.astype(f"S{width}").view(np.uint8).reshape(len(ids), width)
+    lengths = np.char.str_len(encoded)
+    value = np.full(len(ids), _FNV_OFFSET)
+    for k in range(width):  # over the letters of the longest id, all ids at once
+        live = lengths > k
+        value[live] = (value[live] ^ matrix[live, k].astype(np.uint64)) * _FNV_PRIME
+    return value

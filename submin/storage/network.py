@@ -1,0 +1,215 @@
+"""A network to ask for control: the Python face of submin."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+from submin.adjustment.elimination import Sums
+from submin.adjustment.images import ImageSet
+from submin.errors import QueryError
+from submin.network.cell import Cell
+from submin.network.network_image import image_set
+from submin.network.sub_min import SubMin
+from submin.query.control_set import ControlSet
+from submin.query.planner import Answer, answer, points_in_area, points_named, points_of_tile, well_spread
+from submin.storage.arrays import read_record
+from submin.storage.network_store import Snapshot
+from submin.storage.schema import read_sums_of
+from submin.tiling.cover import Cover
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+CACHED_CELLS = 64
+
+
+class Network:
+    """One version of a network, read only. It does not change while later versions are written; open it again to see them.
+
+    Examples
+    --------
+    ``network = submin.open("network"); control = network.query(bbox=(west, south, east, north))``
+    """
+
+    def __init__(self, place: str, version: str | None = None) -> None:
+        self._snapshot = Snapshot.open(place, version)
+        self._cells: OrderedDict[int, Cell] = OrderedDict()
+        self._numbers: tuple[int, ...] | None = None
+
+    @property
+    def version(self) -> str:
+        """Name of the version, such as ``v12``."""
+        return self._snapshot.version
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The version in the store."""
+        return self._snapshot
+
+    def at(self, version: str) -> Network:
+        """The same network at another version.
+
+        Raises
+        ------
+        QueryError
+            When there is no such version.
+        """
+        return Network(self._snapshot.place, version)
+
+    def query(
+        self,
+        *,
+        bbox: tuple[float, float, float, float] | None = None,
+        area: BaseGeometry | None = None,
+        points: Sequence[str] | NDArray[np.str_] | None = None,
+        tile: str | None = None,
+        policy: str = "auto",
+        max_points: int | None = None,
+    ) -> ControlSet:
+        """Control points with their joint covariance.
+
+        Parameters
+        ----------
+        bbox : west, south, east, north in degrees (west above east: across the antimeridian)
+        area : polygon or polygons, longitude and latitude in degrees
+        points : ids of points
+        tile : name of a tile; alone, all points that it holds
+        policy : ``auto``, ``tile``, ``ci`` or ``rigorous`` (docs/accuracy.md)
+        max_points : at most so many, well spread and seen by many rays
+
+        Raises
+        ------
+        QueryError
+            When nothing or too much is asked, a policy, tile or point is unknown, or a box is not one.
+        """
+        asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
+        if len(asked) > 1 or (not asked and tile is None):
+            raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
+        number = None if tile is None else self.cover.tile_number(tile)
+        if bbox is not None:
+            area = _box(bbox)
+        if area is not None:
+            selections = points_in_area(self, area)
+        elif points is not None:
+            ids = np.unique(np.asarray(points, dtype=np.str_))
+            selections = points_named(self, ids, self._snapshot.candidate_cells(ids))
+        else:
+            assert number is not None
+            selections = points_of_tile(self, number)
+        if number is not None:
+            held = set(self.cover.cells_held(number))
+            selections = [s for s in selections if s.cell.number in held]
+        if max_points is not None:
+            selections = well_spread(selections, max_points)
+        return self._control_set(answer(self, selections, policy, number))
+
+    def tile(self, name: str) -> TileView:
+        """One sub-MIN alone."""
+        return TileView(self, self.cover.tile_number(name))
+
+    @property
+    def cover(self) -> Cover:
+        """Tiles and cells."""
+        return self._snapshot.cover
+
+    def cell_numbers(self) -> tuple[int, ...]:
+        """Cells that hold points, ascending."""
+        if self._numbers is None:
+            self._numbers = self._snapshot.cell_numbers()
+        return self._numbers
+
+    def cell(self, number: int) -> Cell:
+        """A cell without its sums; the latest used ones are kept in memory."""
+        if number not in self._cells:
+            self._cells[number] = self._snapshot.cell(number, with_sums=False)
+            if len(self._cells) > CACHED_CELLS:
+                self._cells.popitem(last=False)
+        self._cells.move_to_end(number)
+        return self._cells[number]
+
+    def cell_sums(self, number: int) -> tuple[Index, Sums]:
+        """A cell's images and sums."""
+        group = self._snapshot.root["cells/" + self.cover.cell_name(number)]
+        parts = read_record(group, ["images", "vector", "information"])
+        return parts["images"].astype(np.int32), read_sums_of(group, parts)
+
+    def sub_min(self, tile: int, images: Index | None) -> SubMin:
+        """A tile's sub-MIN, or its marginal on some images."""
+        if tile not in self._snapshot.tile_numbers():
+            raise QueryError(f"tile {self.cover.tile_name(tile)} holds nothing yet; see 'submin info'")
+        return self._snapshot.sub_min(tile, images)
+
+    def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
+        """Images of these rows."""
+        return image_set(self._snapshot.images(rows), self._snapshot.metadata.ellipsoid)
+
+    def _control_set(self, found: Answer) -> ControlSet:
+        metadata, cover = self._snapshot.metadata, self.cover
+        blocks = self._snapshot.image_columns(["block_id"])["block_id"] if len(found.images) else np.empty(0, dtype="U1")
+        return ControlSet(
+            ids=found.ids,
+            geocentric=found.geocentric,
+            covariance=found.covariance,
+            ellipsoid=metadata.ellipsoid,
+            frame=metadata.frame,
+            epoch=metadata.epoch,
+            policy=found.policy,
+            tiles=tuple(cover.tile_name(t) for t in found.tiles),
+            tile_of_point=np.array([cover.tile_name(t) for t in found.owner], dtype=np.str_),
+            rays=found.rays,
+            version=self.version,
+            blocks=tuple(np.unique(blocks[found.images]).tolist()) if len(found.images) else (),
+            scope="network" if found.network_wide else "tiles",
+        )
+
+
+class TileView:
+    """One sub-MIN of a network, by itself."""
+
+    def __init__(self, network: Network, number: int) -> None:
+        self._network, self._number = network, number
+
+    @property
+    def name(self) -> str:
+        """Name of the tile."""
+        return self._network.cover.tile_name(self._number)
+
+    def query(self, ids: Sequence[str] | None = None) -> ControlSet:
+        """Control points of this sub-MIN alone: those named, or all that it holds."""
+        return self._network.query(points=ids, tile=self.name, policy="tile")
+
+    def covariance(self, ids: Sequence[str]) -> Array:
+        """Joint covariance (3n, 3n) of points, geocentric square metres, in the order of their ids ascending, from this sub-MIN alone."""
+        return self.query(ids).covariance
+
+
+def _box(bbox: tuple[float, float, float, float]) -> BaseGeometry:
+    west, south, east, north = bbox
+    if not (np.isfinite(bbox).all() and -90.0 <= south < north <= 90.0 and -180.0 <= west <= 180.0 and -180.0 <= east <= 180.0):
+        swapped = -90.0 <= west < east <= 90.0 and abs(south) > 90.0
+        raise QueryError(
+            f"bbox is {west:g} {south:g} {east:g} {north:g}; expected west south east north in degrees"
+            + ("; longitude and latitude look swapped" if swapped else "")
+        )
+    if west > east:
+        return shapely.union_all([shapely.box(west, south, 180.0, north), shapely.box(-180.0, south, east, north)])
+    return shapely.box(west, south, east, north)
+
+
+def open_network(path: str | Path, version: str | None = None) -> Network:
+    """Open a network, read only: its newest version, or the one named.
+
+    Raises
+    ------
+    StoreError
+        When there is no network at the path or URL.
+    QueryError
+        When there is no such version.
+    """
+    return Network(str(path), version)

@@ -1,0 +1,222 @@
+"""One network on disk: an Icechunk repository with a version per batch. Readers see one version, whole, whatever is being written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import icechunk
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from submin.errors import ConflictError, QueryError, StoreError
+from submin.network.cell import Cell, empty_cell
+from submin.network.network_image import NetworkImage
+from submin.network.sub_min import SubMin
+from submin.storage.arrays import create_table, hash_ids, read_record, read_table, table_length
+from submin.storage.schema import (
+    DIRECTORY_COLUMNS,
+    IMAGE_COLUMNS,
+    LEDGER_COLUMNS,
+    NetworkMetadata,
+    network_images,
+    read_cell,
+    read_sub_min,
+)
+from submin.tiling.cover import Cover
+
+icechunk.set_logs_filter("icechunk=error")
+BRANCH = "main"
+
+
+@dataclass(frozen=True)
+class Version:
+    """One version of a network: its number, the snapshot that holds it, when and with what message it was committed."""
+
+    number: int
+    snapshot: str
+    written: datetime
+    message: str
+
+    @property
+    def name(self) -> str:
+        """``v12``."""
+        return f"v{self.number}"
+
+
+def _storage(place: str) -> icechunk.Storage:
+    if place.startswith("s3://"):
+        bucket, _, prefix = place.removeprefix("s3://").partition("/")
+        return icechunk.s3_storage(bucket=bucket, prefix=prefix or None, from_env=True)
+    return icechunk.local_filesystem_storage(place)
+
+
+def _open_repository(place: str) -> icechunk.Repository:
+    if "://" not in place and not Path(place).is_dir():
+        raise StoreError(f"{place}: no such network; make one with 'submin create'")
+    try:
+        return icechunk.Repository.open(_storage(place))
+    except icechunk.IcechunkError as error:
+        raise StoreError(f"{place}: not a network ({str(error).strip().splitlines()[0]}); make one with 'submin create'") from None
+
+
+def create_network(place: str, metadata: NetworkMetadata) -> Version:
+    """Create an empty network, its version 0.
+
+    Raises
+    ------
+    StoreError
+        When something is already there or the place cannot be written.
+    """
+    if "://" not in place and Path(place).exists() and (not Path(place).is_dir() or any(Path(place).iterdir())):
+        raise StoreError(f"{place}: already exists; choose another place, or remove it first")
+    try:
+        repository = icechunk.Repository.create(_storage(place))
+        session = repository.writable_session(BRANCH)
+        root = zarr.create_group(session.store, attributes=metadata.to_attributes() | {"version": 0})
+        root.create_group("cells")
+        root.create_group("tiles")
+        create_table(root, "images", IMAGE_COLUMNS)
+        create_table(root, "ledger", LEDGER_COLUMNS)
+        create_table(root, "directory", DIRECTORY_COLUMNS)
+        session.commit("created", metadata={"version": 0})
+    except (icechunk.IcechunkError, OSError) as error:
+        raise StoreError(f"{place}: cannot be written ({str(error).strip().splitlines()[0]})") from error
+    return versions(place)[0]
+
+
+def versions(place: str) -> list[Version]:
+    """All versions of a network, the newest first."""
+    repository = _open_repository(place)
+    return [
+        Version(int(a.metadata["version"]), a.id, a.written_at, a.message)
+        for a in repository.ancestry(branch=BRANCH)
+        if "version" in a.metadata
+    ]
+
+
+class Snapshot:
+    """One version of a network, read only. Everything is read when asked for; nothing is kept but small tables."""
+
+    def __init__(self, root: zarr.Group, place: str) -> None:
+        self.root = root
+        self.place = place
+        self.metadata = NetworkMetadata.from_attributes(root.attrs, place)
+        self.cover = Cover.from_mapping(self.metadata.cover)
+        self.number = int(root.attrs["version"])
+
+    @classmethod
+    def open(cls, place: str, version: str | None = None) -> Snapshot:
+        """Open the newest version, or the one named (``v12``).
+
+        Raises
+        ------
+        StoreError, QueryError
+            When there is no network, or no such version.
+        """
+        repository = _open_repository(place)
+        if version is None:
+            session = repository.readonly_session(BRANCH)
+        else:
+            known = versions(place)
+            found = [v for v in known if v.name == version]
+            if not found:
+                raise QueryError(f"version is {version!r}; expected one of v0 to {known[0].name} (see 'submin history')")
+            session = repository.readonly_session(snapshot_id=found[0].snapshot)
+        try:
+            return cls(zarr.open_group(session.store, mode="r"), place)
+        except FileNotFoundError:
+            raise StoreError(f"{place}: holds a repository but no network; make one with 'submin create'") from None
+
+    @property
+    def version(self) -> str:
+        """``v12``."""
+        return f"v{self.number}"
+
+    def cell(self, number: int, *, with_sums: bool = True) -> Cell:
+        """A cell, empty when it has no points yet."""
+        name = "cells/" + self.cover.cell_name(number)
+        if name not in self.root:
+            return empty_cell(number, self.metadata.parameters)
+        return read_cell(self.root[name], with_sums=with_sums)
+
+    def cell_numbers(self) -> tuple[int, ...]:
+        """Cells that hold points or rays, ascending."""
+        return tuple(sorted(self.cover.cell_number(name) for name in self.root["cells"].group_keys()))
+
+    def cell_attributes(self, number: int) -> dict[str, Any]:
+        """Counts of a cell, without reading it."""
+        return dict(self.root["cells/" + self.cover.cell_name(number)].attrs)
+
+    def tile_numbers(self) -> tuple[int, ...]:
+        """Tiles that have a sub-MIN, ascending."""
+        return tuple(sorted(self.cover.tile_number(name) for name in self.root["tiles"].group_keys()))
+
+    def sub_min(self, tile: int, images: NDArray[np.int32] | None = None) -> SubMin:
+        """A tile's sub-MIN, or its marginal on some images."""
+        return read_sub_min(self.root["tiles/" + self.cover.tile_name(tile)], images)
+
+    def tile_images(self, tile: int) -> NDArray[np.int32]:
+        """Rows of the images that a tile sees."""
+        return np.asarray(read_record(self.root["tiles/" + self.cover.tile_name(tile)], ["images"])["images"], dtype=np.int32)
+
+    def image_count(self) -> int:
+        """Number of images in the network."""
+        return table_length(self.root["images"])
+
+    def images(self, rows: Sequence[int] | NDArray[np.integer] | None = None) -> list[NetworkImage]:
+        """Images of these rows (ascending), or all."""
+        table, wanted = self.root["images"], [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")]
+        if rows is None:
+            return network_images(read_table(table, wanted))
+        if not len(rows):
+            return []
+        low, high = int(min(rows)), int(max(rows)) + 1
+        span = network_images(read_table(table, wanted, low, high))
+        return [span[int(r) - low] for r in rows]
+
+    def image_columns(self, wanted: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Columns of the image table."""
+        return read_table(self.root["images"], wanted)
+
+    def ledger(self, wanted: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
+        """Columns of the ledger of blocks; a block's last row counts."""
+        return read_table(self.root["ledger"], wanted)
+
+    def candidate_cells(self, point_ids: NDArray[np.str_]) -> NDArray[np.int64]:
+        """Cell (n,) in which each point would be, by the directory; -1 for points that are not in the network."""
+        directory = read_table(self.root["directory"])
+        cells = np.full(len(point_ids), -1, dtype=np.int64)
+        if not len(directory["hash"]) or not len(point_ids):
+            return cells
+        wanted, inverse = np.unique(hash_ids(point_ids), return_inverse=True)
+        at = np.minimum(np.searchsorted(wanted, directory["hash"]), len(wanted) - 1)
+        hits = np.flatnonzero(wanted[at] == directory["hash"])
+        found = np.full(len(wanted), -1, dtype=np.int64)
+        found[at[hits]] = directory["cell"][hits]  # entries are in order of arrival, and the last assignment stays
+        return found[inverse]
+
+
+def commit(session: icechunk.Session, version: int, message: str) -> None:
+    """Commit a batch as one version.
+
+    Raises
+    ------
+    ConflictError
+        When another coordinator committed meanwhile; nothing of this batch is in the network then.
+    """
+    try:
+        session.commit(message, metadata={"version": version})
+    except icechunk.ConflictError:
+        raise ConflictError(
+            "another run committed to this network meanwhile; nothing of this batch was written: give the same command again"
+        ) from None
+
+
+def writable_session(place: str) -> icechunk.Session:
+    """A session in which to write the next version."""
+    return _open_repository(place).writable_session(BRANCH)

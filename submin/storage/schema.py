@@ -1,0 +1,179 @@
+"""What a network's store holds, and cells and sub-MINs as records of it (docs/decisions/002-store-layout.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from submin.adjustment.elimination import Sums
+from submin.adjustment.estimation import fill_symmetric
+from submin.adjustment.rays import Rays
+from submin.errors import StoreError
+from submin.geodesy import Ellipsoid
+from submin.network.cell import Cell
+from submin.network.network_image import NetworkImage
+from submin.network.sub_min import SubMin
+from submin.storage.arrays import read_record, write_record
+
+FORMAT_VERSION = 1
+COVARIANCE_CHUNK = 256
+
+IMAGE_COLUMNS = {
+    "image_id": "text", "block_id": "text", "pass_id": "text", "platform": "text", "sensor": "text", "camera": "text",
+    "width": "int64", "height": "int64", "acquired": "text", "seconds": "float64", "footprint": "text", "licence": "text",
+    "a_priori": "text", "released": "uint8",
+}  # fmt: skip
+LEDGER_COLUMNS = {
+    "block_id": "text", "content": "text", "status": "text", "reason": "text", "version": "int64",
+    "images": "int64", "rays": "int64", "rays_rejected": "int64",
+}  # fmt: skip
+DIRECTORY_COLUMNS = {"hash": "uint64", "cell": "int64"}
+
+
+@dataclass(frozen=True)
+class NetworkMetadata:
+    """What is fixed when a network is created.
+
+    Attributes
+    ----------
+    name, body, frame, epoch : texts; heights are ellipsoidal
+    semimajor_axis, flattening : ellipsoid (metres)
+    cover : description of the cover, see `Cover.to_mapping`
+    form : ``factored``
+    parameters : adjustable parameters kept for each image
+    format_version : of the store
+    """
+
+    name: str
+    body: str
+    frame: str
+    epoch: str
+    semimajor_axis: float
+    flattening: float
+    cover: dict[str, Any]
+    form: str = "factored"
+    parameters: int = 6
+    format_version: int = FORMAT_VERSION
+
+    @property
+    def ellipsoid(self) -> Ellipsoid:
+        """Ellipsoid of the body."""
+        return Ellipsoid(self.semimajor_axis, self.flattening)
+
+    def to_attributes(self) -> dict[str, Any]:
+        """Attributes of the store's root."""
+        return {"submin": asdict(self)}
+
+    @classmethod
+    def from_attributes(cls, attributes: Any, place: str) -> NetworkMetadata:
+        """Metadata of a store's root; raises `StoreError` for something else or another format version."""
+        values = attributes.get("submin")
+        if not isinstance(values, dict):
+            raise StoreError(f"{place}: not a network (its root has no 'submin' attributes); make one with 'submin create'")
+        if values.get("format_version") != FORMAT_VERSION:
+            raise StoreError(
+                f"{place}: format version {values.get('format_version')}; this program reads {FORMAT_VERSION}: open it with the release that wrote it"
+            )
+        return cls(**values)
+
+
+def pack_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lower triangle, row by row."""
+    return np.asarray(matrix[np.tril_indices(len(matrix))])
+
+
+def unpack_lower(packed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lower triangular matrix from `pack_lower`; zeros above the diagonal."""
+    size = (int(np.sqrt(8 * packed.size + 1)) - 1) // 2
+    matrix = np.zeros((size, size))
+    matrix[np.tril_indices(size)] = packed
+    return matrix
+
+
+def write_cell(root: zarr.Group, name: str, cell: Cell) -> None:
+    """Write a cell, replacing its earlier state."""
+    rays, sums = cell.rays, cell.sums
+    write_record(
+        root["cells"], name,
+        {
+            "point_ids": cell.point_ids, "final": cell.final, "ray_point": rays.point, "ray_image": rays.image, "accepted": rays.accepted,
+            "images": cell.images, "origin": cell.origin, "linearised_at": cell.linearised_at, "theta": cell.theta,
+            "observed": rays.observed, "sigma": rays.sigma, "vector": sums.vector, "information": pack_lower(sums.information),
+        },
+        {"number": cell.number, "misclosure": sums.misclosure, "redundancy": sums.redundancy,
+         "points": len(cell.point_ids), "determined": int(determined(cell).sum()), "rays": len(rays), "accepted": int(rays.accepted.sum())},
+    )  # fmt: skip
+
+
+def determined(cell: Cell) -> NDArray[np.bool_]:
+    """Points (n,) with at least two accepted rays."""
+    return np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell.point_ids)) >= 2
+
+
+def read_cell(group: zarr.Group, *, with_sums: bool = True) -> Cell:
+    """The cell of a record; without sums (left empty) the large part is not read."""
+    wanted = [
+        "point_ids", "final", "ray_point", "ray_image", "accepted", "images", "origin", "linearised_at", "theta", "observed", "sigma",
+    ]  # fmt: skip
+    parts = read_record(group, None if with_sums else wanted)
+    rays = Rays(
+        parts["ray_point"].astype(np.int32), parts["ray_image"].astype(np.int32), parts["observed"], parts["sigma"],
+        parts["accepted"].astype(np.bool_),
+    )  # fmt: skip
+    sums = read_sums_of(group, parts) if with_sums else Sums(np.empty((0, 0)), np.empty(0), 0.0, 0)
+    return Cell(
+        int(group.attrs["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"], parts["final"].astype(np.bool_),
+        parts["images"].astype(np.int32), parts["theta"], rays, sums,
+    )  # fmt: skip
+
+
+def read_sums_of(group: zarr.Group, parts: dict[str, NDArray[Any]]) -> Sums:
+    """Sums among the parts of a cell's record."""
+    return Sums(
+        unpack_lower(parts["information"]), parts["vector"], float(group.attrs["misclosure"]), int(group.attrs["redundancy"])
+    )  # fmt: skip
+
+
+def write_sub_min(root: zarr.Group, name: str, sub_min: SubMin, cells: Sequence[int]) -> None:
+    """Write a tile's sub-MIN, replacing its earlier state; of the covariance only blocks on and below the diagonal."""
+    group = write_record(
+        root["tiles"], name,
+        {"images": sub_min.images, "cells": np.array(cells, dtype=np.int64), "theta": sub_min.theta},
+        {"chi_square": sub_min.chi_square, "redundancy": sub_min.redundancy},
+    )  # fmt: skip
+    size = len(sub_min.covariance)
+    chunk = min(COVARIANCE_CHUNK, max(size, 1))
+    array = group.create_array("covariance", shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=None)
+    for start in range(0, size, chunk):
+        array[start : start + chunk, : start + chunk] = sub_min.covariance[start : start + chunk, : start + chunk]
+
+
+def read_sub_min(group: zarr.Group, images: NDArray[np.int32] | None = None) -> SubMin:
+    """A tile's sub-MIN; with ``images`` (rows of the network, ascending) its marginal on those of them that it holds."""
+    parts = read_record(group, ["images", "theta"])
+    held, theta = parts["images"].astype(np.int32), parts["theta"]
+    chosen = np.arange(len(held)) if images is None else np.flatnonzero(np.isin(held, images))
+    p = theta.shape[1]
+    rows = (chosen[:, None] * p + np.arange(p)).ravel()
+    array = group["covariance"]
+    covariance = array[:, :] if len(chosen) == len(held) else array.oindex[rows, rows]
+    return SubMin(
+        held[chosen], theta[chosen], fill_symmetric(np.ascontiguousarray(covariance)),
+        float(group.attrs["chi_square"]), int(group.attrs["redundancy"]),
+    )  # fmt: skip
+
+
+def network_images(columns: dict[str, NDArray[Any]]) -> list[NetworkImage]:
+    """Images from columns of the image table."""
+    return [
+        NetworkImage(str(i), str(b), str(p), str(s), str(c), int(w), int(h), float(t), str(a), bool(r))
+        for i, b, p, s, c, w, h, t, a, r in zip(
+            *(columns[k] for k in ("image_id", "block_id", "pass_id", "sensor", "camera", "width", "height", "seconds", "a_priori", "released")),
+            strict=True,
+        )
+    ]  # fmt: skip
