@@ -1,0 +1,1 @@
+"""Dask, the command line, and all that a person sees."""

@@ -7,7 +7,7 @@ leaves the last version as it is.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import icechunk
@@ -29,7 +29,7 @@ from orchestration.tasks import (
 )
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import SAME_POINT_METRES, ArrivingRays, Registration, register
-from submin.storage.arrays import append_table, hash_ids, set_rows
+from submin.storage.arrays import append_table, group_of, hash_ids, set_rows
 from submin.storage.catalogue_schema import Block
 from submin.storage.network_store import Snapshot, commit, writable_session
 
@@ -53,15 +53,14 @@ class BatchResult:
     version : number of the committed version
     fused : ids of the fused blocks; rejected : the others
     flagged : images whose camera was found bad in this batch
-    cells : reports of all cells that were judged, by cell
-    unsettled : tiles whose judgement did not come to rest (their rays are used as last judged)
+    tiles : that were judged; unsettled : tiles whose judgement did not come to rest (their rays are used as last judged)
     """
 
     version: int
     fused: tuple[str, ...]
     rejected: tuple[Rejected, ...]
     flagged: tuple[FlaggedImage, ...]
-    cells: dict[int, CellReport]
+    tiles: tuple[int, ...]
     unsettled: tuple[int, ...]
 
 
@@ -85,14 +84,24 @@ def fuse_batch(place: str, blocks: Sequence[Block], rejected: Sequence[Rejected]
     if blocks:
         reports, flagged, writes = _fuse(session, base, registration, images, executor, reporter)
         session.merge(*writes)
+    elif _already_entered(base, refused):
+        return BatchResult(base.number, (), tuple(refused), (), (), ())
     cells = {number: report for tile in reports for number, report in tile.cells.items()}
     version = base.number + 1
     _enter(session, base, version, blocks, refused, images, registration, rays, flagged, cells)
     fused = tuple(block.block_id for block in blocks)
     commit(session, version, f"{len(fused)} blocks fused, {len(refused)} rejected")
     return BatchResult(
-        version, fused, tuple(refused), tuple(flagged.values()), cells, tuple(r.tile for r in reports if not r.converged)
+        version, fused, tuple(refused), tuple(flagged.values()),
+        tuple(r.tile for r in reports), tuple(r.tile for r in reports if not r.converged),
     )  # fmt: skip
+
+
+def _already_entered(base: Snapshot, refused: Sequence[Rejected]) -> bool:
+    """True when the ledger's last word on each of these blocks is the same rejection: the same command again then writes nothing."""
+    ledger = base.ledger(["block_id", "status", "reason"])
+    last = {str(b): (str(s), str(r)) for b, s, r in zip(ledger["block_id"], ledger["status"], ledger["reason"], strict=True)}
+    return all(last.get(r.block_id) == ("rejected", r.reason) for r in refused)
 
 
 def _stage_one(
@@ -126,7 +135,7 @@ def _register(
         old = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(c.images for c in cells.values())])).astype(np.int32)
         rows = np.concatenate([old, np.arange(first_image, first_image + len(images), dtype=np.int32)])
         registration = register(
-            rays, image_set([*base.images(old), *images], base.metadata.ellipsoid), rows, known, cells, base.cover
+            rays, image_set([*base.images(old), *images], base.metadata.ellipsoid, base.metadata.parameters), rows, known, cells, base.cover
         )  # fmt: skip
         bad = _misplaced(blocks, rays, registration)
         if not bad:
@@ -139,8 +148,8 @@ def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Regist
     """Blocks of the batch that cannot be registered, with the reason."""
     bad: dict[int, str] = {}
     inside = np.bincount(rays.block[~registration.outside], minlength=len(blocks))
-    for k in np.flatnonzero(inside == 0):
-        bad[int(k)] = "the block lies wholly outside the area of the network; check the axis order, or create a network whose area holds it"
+    for empty in np.flatnonzero(inside == 0):
+        bad[int(empty)] = "the block lies wholly outside the area of the network; check the axis order, or create a network whose area holds it"
     far = np.flatnonzero(registration.misfit > SAME_POINT_METRES)
     if len(far):
         # two rays of one id that disagree: the later block is in error
@@ -179,11 +188,11 @@ def _fuse(
     flagged = {image.row: image for report in reports for image in report.flagged}
     changed = {cell for report in reports for cell in report.changed}
     again = {tile for cell in changed for tile in cover.holders(cell)} | _tiles_that_see(base, set(flagged))
-    arguments = []
+    to_factor = []
     for tile in sorted(again):
         sources = sorted({cover.owner(c) for c in cover.cells_held(tile)} & set(by_tile))
-        arguments.append((session.fork(), tile, [by_tile[t] for t in sources], shared, sorted(flagged)))
-    handles = executor.submit_all(factor_tile, arguments, "factor-tile", reporter.stage("factoring tiles", len(arguments)))
+        to_factor.append((session.fork(), tile, [by_tile[t] for t in sources], shared, sorted(flagged)))
+    handles = executor.submit_all(factor_tile, to_factor, "factor-tile", reporter.stage("factoring tiles", len(to_factor)))
     writes = [report.writes for report in reports] + [done.writes for done in executor.results(handles)]
     return reports, flagged, writes
 
@@ -202,7 +211,7 @@ def _enter(
     root = zarr.open_group(session.store, mode="r+")
     first = base.image_count()
     records = [image for block in blocks for image in block.images]
-    append_table(root["images"], {
+    append_table(group_of(root, "images"), {
         "image_id": _texts(i.image_id for i in images), "block_id": _texts(i.block_id for i in images),
         "pass_id": _texts(i.pass_id for i in images), "platform": _texts(r.platform for r in records),
         "sensor": _texts(i.sensor for i in images), "camera": _texts(i.camera for i in images),
@@ -211,7 +220,7 @@ def _enter(
         "footprint": _texts(r.footprint.hex() for r in records), "licence": _texts(r.licence for r in records),
         "a_priori": _texts(i.a_priori for i in images), "released": np.zeros(len(images), dtype=np.uint8),
     })  # fmt: skip
-    set_rows(root["images"], "released", np.array(sorted(flagged), dtype=np.int64), np.ones(len(flagged), dtype=np.uint8))
+    set_rows(group_of(root, "images"), "released", np.array(sorted(flagged), dtype=np.int64), np.ones(len(flagged), dtype=np.uint8))
 
     used = np.zeros(first + len(images), dtype=np.int64)
     rejected = np.zeros_like(used)
@@ -220,7 +229,7 @@ def _enter(
         np.add.at(rejected, report.images, report.rejected)
     of_block = np.repeat(np.arange(len(blocks)), [len(block.images) for block in blocks]) if blocks else np.empty(0, dtype=np.int64)
     lost = np.bincount(of_block, weights=rejected[first:], minlength=len(blocks)).astype(np.int64)
-    append_table(root["ledger"], {
+    append_table(group_of(root, "ledger"), {
         "block_id": _texts([*(b.block_id for b in blocks), *(r.block_id for r in refused)]),
         "content": _texts([*(b.content_hash() for b in blocks), *("" for _ in refused)]),
         "status": _texts([*("fused" for _ in blocks), *("rejected" for _ in refused)]),
@@ -231,12 +240,12 @@ def _enter(
         "rays_rejected": np.array([*lost, *(0 for _ in refused)], dtype=np.int64),
     })  # fmt: skip
     ids, at = registration.directory
-    append_table(root["directory"], {"hash": hash_ids(ids), "cell": at})
+    append_table(group_of(root, "directory"), {"hash": hash_ids(ids), "cell": at})
     root.attrs["version"] = version
 
 
-def _texts(values: object) -> NDArray[np.str_]:
-    listed = [str(value) for value in values]  # type: ignore[attr-defined]
+def _texts(values: Iterable[str]) -> NDArray[np.str_]:
+    listed = list(values)
     return np.array(listed, dtype=np.str_) if listed else np.empty(0, dtype="U1")
 
 

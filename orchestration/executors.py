@@ -92,7 +92,7 @@ class DaskExecutor:
             return handles[k]
 
         first = [f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None]
-        running = as_completed(first)
+        running: Any = as_completed(first)
         for future in running:
             if future.status != "finished":
                 future.result()  # raises the task's error here
@@ -108,7 +108,7 @@ class DaskExecutor:
 
     def peak_memory_mb(self) -> float:
         """See `Executor.peak_memory_mb`."""
-        return own_peak_memory_mb() + sum(self.client.run(own_peak_memory_mb).values())
+        return own_peak_memory_mb() + float(sum(self.client.run(own_peak_memory_mb).values()))
 
 
 @contextmanager

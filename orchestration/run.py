@@ -13,7 +13,7 @@ import numpy as np
 from orchestration.batch import BatchResult, Rejected, fuse_batch
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
-from orchestration.tasks import CellReport, FlaggedImage
+from orchestration.tasks import FlaggedImage
 from submin.errors import InputError
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, defects
@@ -29,7 +29,7 @@ class RunResult:
     Attributes
     ----------
     version : of the network afterwards; fused, skipped : numbers of blocks; rejected, flagged : with reasons
-    rays_used, rays_rejected : rays in the cells that the run judged; ray_rms_px : of the used ones, per coordinate
+    rays_used, rays_rejected : rays in the network afterwards; ray_rms_px : residual of the used ones, per coordinate
     """
 
     version: str
@@ -95,7 +95,6 @@ class Ledger:
 
 @dataclass
 class _Tally:
-    cells: dict[int, CellReport] = field(default_factory=dict)
     rejected: list[Rejected] = field(default_factory=list)
     flagged: dict[int, FlaggedImage] = field(default_factory=dict)
     unsettled: set[int] = field(default_factory=set)
@@ -103,10 +102,9 @@ class _Tally:
     skipped: int = 0
 
     def add(self, batch: BatchResult) -> None:
-        self.cells.update(batch.cells)
         self.rejected.extend(batch.rejected)
         self.flagged.update({f.row: f for f in batch.flagged})
-        self.unsettled = (self.unsettled - {c // 9 for c in batch.cells}) | set(batch.unsettled)
+        self.unsettled = (self.unsettled - set(batch.tiles)) | set(batch.unsettled)
         self.fused += len(batch.fused)
 
 
@@ -131,18 +129,16 @@ def run(
     while batch := list(islice(blocks, max(batch_blocks, 1))):
         good = [block for block, reason in batch if reason is None]
         refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-        if good:
-            tally.add(fuse_batch(place, good, refused, executor, reporter))
-        else:
-            tally.rejected.extend(refused)
+        tally.add(fuse_batch(place, good, refused, executor, reporter))
         reporter.fused(len(batch))
 
-    used = sum(int(c.used.sum()) for c in tally.cells.values())
-    square = sum(c.square_px for c in tally.cells.values())
     after = Snapshot.open(place)
+    cells = [after.cell_attributes(number) for number in after.cell_numbers()]
+    used = sum(cell["accepted"] for cell in cells)
+    square = sum(cell["square_px"] for cell in cells)
     return RunResult(
         after.version, tally.fused, tally.skipped, tuple(tally.rejected), tuple(tally.flagged.values()),
-        float(np.sqrt(square / (2.0 * used))) if used else 0.0, used, sum(int(c.rejected.sum()) for c in tally.cells.values()),
+        float(np.sqrt(square / (2.0 * used))) if used else 0.0, used, sum(cell["rays"] for cell in cells) - used,
         tuple(after.cover.tile_name(t) for t in sorted(tally.unsettled)), time.monotonic() - started, executor.peak_memory_mb(),
     )  # fmt: skip
 

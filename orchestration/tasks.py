@@ -64,12 +64,11 @@ class FlaggedImage:
 
 @dataclass(frozen=True)
 class CellReport:
-    """Counts of a cell after a batch: accepted and rejected rays by image row, and the sum of squared residuals in pixels."""
+    """Counts of a cell after a batch: accepted and rejected rays by image row."""
 
     images: NDArray[np.int32]
     used: NDArray[np.int64]
     rejected: NDArray[np.int64]
-    square_px: float
 
 
 @dataclass(frozen=True)
@@ -159,9 +158,10 @@ def update_tile(
         if number in arrivals:
             cell = with_rays(cell, arrivals[number])
         cells[number] = cell
-    held = [cell for cell in cells.values() if len(cell)]
+    # a cell that has lost its last point is kept here, so that its empty state is written
+    held = [cell for cell in cells.values() if len(cell) or cell.number in departures]
     rows = union_of_images(held)
-    images = image_set(_images(snapshot, rows, new_images), snapshot.metadata.ellipsoid)
+    images = image_set(_images(snapshot, rows, new_images), snapshot.metadata.ellipsoid, snapshot.metadata.parameters)
     rays, _ = bundle(held, rows)
     # every ray is judged afresh, also one rejected on less evidence: decisions follow from the rays, not from their order of arrival
     rays = rays.with_accepted(np.ones(len(rays), dtype=np.bool_))
@@ -182,9 +182,9 @@ def update_tile(
         judged = replace(cell, rays=cell.rays.with_accepted(accepted))
         if changed or second_order(judged, images.take(own_images), theta, ground) > SECOND_ORDER_PIXELS:
             new = summed(replace(judged, theta=theta, linearised_at=ground), images.take(own_images))
-            write_cell(root, snapshot.cover.cell_name(cell.number), new)
+            write_cell(root, snapshot.cover.cell_name(cell.number), new, float(squares[own_rays].sum()))
             sums[cell.number] = (new.images, new.sums)
-        reports[cell.number] = _report(judged, float(squares[own_rays].sum()))
+        reports[cell.number] = _report(judged)
     flagged = _flagged(result, images, rows)
     return TileUpdate(tile, sums, TileReport(tile, tuple(sums), reports, flagged, result.converged, writes))
 
@@ -215,7 +215,7 @@ def factor_tile(
     rows = np.unique(np.concatenate([part[0] for part in parts])).astype(np.int32)
     gone = set(released)
     images = [replace(image, released=image.released or int(row) in gone) for row, image in zip(rows, _images(snapshot, rows, new_images), strict=True)]
-    sub_min = factor(add_sums(parts, rows, snapshot.metadata.parameters), rows, image_set(images, snapshot.metadata.ellipsoid))
+    sub_min = factor(add_sums(parts, rows, snapshot.metadata.parameters), rows, image_set(images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters))
     write_sub_min(root, snapshot.cover.tile_name(tile), sub_min, cells)
     return TileFactored(tile, len(rows), writes)
 
@@ -227,10 +227,10 @@ def _images(snapshot: Snapshot, rows: NDArray[np.int32], new: Sequence[NetworkIm
     return [*snapshot.images(known), *(new[int(row) - base] for row in rows[rows >= base])]
 
 
-def _report(cell: Cell, square_px: float) -> CellReport:
+def _report(cell: Cell) -> CellReport:
     rays, m = cell.rays, len(cell.images)
     used = np.bincount(rays.image[rays.accepted], minlength=m)
-    return CellReport(cell.images, used, np.bincount(rays.image, minlength=m) - used, square_px)
+    return CellReport(cell.images, used, np.bincount(rays.image, minlength=m) - used)
 
 
 def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> tuple[FlaggedImage, ...]:

@@ -1,0 +1,1 @@
+"""Stage 1: rays and images, adjusted by themselves; points eliminated, blunders rejected."""

@@ -10,13 +10,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from submin.adjustment.elimination import Array, Index, LinearRays, Offsets, _gather, _most_rays, _orthonormal
 
 CRITICAL_RAY = 4.0
 """A ray whose w exceeds this is a blunder (1 good coordinate in 16,000; decision 004 says why not 3.29)."""
-CRITICAL_IMAGE = 3.29
-"""An image whose correction exceeds this many of its standard deviations has a bad camera (1 good parameter in 1,000)."""
+IMAGE_FAMILY = 0.05
+"""Chance that any good image of a set adjusted together is said to have a bad camera (Bonferroni over all parameters tested)."""
 TESTABLE = 0.01
 """A coordinate or parameter is tested when at least this part of its a priori variance is checked by other observations."""
 ROBUST_SCALE = 2.4
@@ -184,6 +185,17 @@ def image_statistics(theta: Array, covariance: Array, prior_variance: Array) -> 
     return np.where(testable, np.abs(theta) / np.sqrt(np.where(testable, free, 1.0)), 0.0)
 
 
+def critical_image(tests: int) -> float:
+    """Critical value for so many two-sided tests of image parameters together.
+
+    Examples
+    --------
+    >>> round(critical_image(19 * 6), 2)
+    3.52
+    """
+    return float(ndtri(1.0 - 0.5 * IMAGE_FAMILY / max(tests, 1)))
+
+
 def bad_cameras(statistics: Array, linear: LinearRays) -> NDArray[np.bool_]:
     """Images (m,) whose camera is to be released now: above the critical value and the worst among the images that they share points with.
 
@@ -194,7 +206,7 @@ def bad_cameras(statistics: Array, linear: LinearRays) -> NDArray[np.bool_]:
     statistics : (m, p), see `image_statistics`; linear : the rays, for which images share points
     """
     worst = statistics.max(axis=1, initial=0.0)
-    suspects = np.flatnonzero(worst > CRITICAL_IMAGE)
+    suspects = np.flatnonzero(worst > critical_image(int((statistics > 0.0).sum())))
     bad = np.zeros(len(worst), dtype=bool)
     if not len(suspects):
         return bad

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from submin.adjustment.priors import ImagePrior, prior_factor
 from submin.geodesy import WGS84, Ellipsoid
-from submin.sensors import Ground, Projection, sensor_named
+from submin.sensors import WIDEST, Ground, Projection, sensor_named
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -29,6 +29,7 @@ class ImageSet:
     cameras : (m, c) packed cameras; rows of sensors with fewer numbers are padded with NaN
     priors : what the a priori factor needs, by image
     ellipsoid : of the body that they look at
+    parameters : adjustable parameters kept for each image
     """
 
     ids: tuple[str, ...]
@@ -36,14 +37,10 @@ class ImageSet:
     cameras: Array
     priors: tuple[ImagePrior, ...]
     ellipsoid: Ellipsoid = WGS84
+    parameters: int = WIDEST
 
     def __len__(self) -> int:
         return len(self.ids)
-
-    @property
-    def parameters(self) -> int:
-        """Adjustable parameters per image: those of the widest sensor in the set."""
-        return max((sensor_named(name).parameters for name in set(self.sensors)), default=0)
 
     @cached_property
     def prior(self) -> sp.csr_array:
@@ -58,6 +55,7 @@ class ImageSet:
             self.cameras[np.asarray(rows, dtype=np.int64)],
             tuple(self.priors[i] for i in rows),
             self.ellipsoid,
+            self.parameters,
         )
 
     def release(self, which: NDArray[np.bool_]) -> ImageSet:
@@ -73,18 +71,17 @@ class ImageSet:
     def project(self, parameters: Array, ground: Ground, image: Index, point: Index) -> Projection:
         """Image coordinates of rays and their partials; see `submin.sensors.Sensor.project`."""
         names = set(self.sensors)
-        if len(names) == 1:
-            return sensor_named(next(iter(names))).project(self.cameras, parameters, ground, image, point)
-        out = Projection(
-            np.empty((len(image), 2)), np.empty((len(image), 2, 3)), np.zeros((len(image), 2, self.parameters))
-        )  # fmt: skip
-        of_image = np.array(self.sensors)
+        if len(names) == 1 and sensor_named(self.sensors[0]).parameters == self.parameters:
+            return sensor_named(self.sensors[0]).project(self.cameras, parameters, ground, image, point)
+        rays = len(image)
+        whole = Projection(np.empty((rays, 2)), np.empty((rays, 2, 3)), np.zeros((rays, 2, self.parameters)))
+        of_image = np.array(self.sensors, dtype=np.str_)
         for name in names:
-            sensor, rays = sensor_named(name), of_image[image] == name
-            part = sensor.project(self.cameras, parameters, ground, image[rays], point[rays])
-            out.image[rays], out.by_ground[rays] = part.image, part.by_ground
-            out.by_parameters[rays, :, : sensor.parameters] = part.by_parameters
-        return out
+            sensor, chosen = sensor_named(name), of_image[image] == name
+            part = sensor.project(self.cameras, parameters, ground, image[chosen], point[chosen])
+            whole.image[chosen], whole.by_ground[chosen] = part.image, part.by_ground
+            whole.by_parameters[chosen, :, : sensor.parameters] = part.by_parameters
+        return whole
 
     def localise(self, image: Index, observed: Array) -> Array:
         """Geodetic coordinates (r, 3) of image coordinates (r, 2) at each camera's mean height, unadjusted cameras."""

@@ -1,0 +1,1 @@
+"""Cells and sub-MINs: the network in factored form."""

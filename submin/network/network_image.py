@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori, ImagePrior
 from submin.geodesy import Ellipsoid
-from submin.sensors import sensor_named
+from submin.sensors import WIDEST, sensor_named
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ def _a_priori(text: str) -> APriori:
     return APriori.from_mapping(json.loads(text))
 
 
-def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid) -> ImageSet:
-    """The images with packed cameras and a priori models.
+def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: int = WIDEST) -> ImageSet:
+    """The images with packed cameras and a priori models, ``parameters`` adjustable ones kept for each.
 
     Raises
     ------
@@ -67,4 +67,4 @@ def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid) -> ImageSet:
     priors = tuple(
         ImagePrior(i.block_id, i.pass_id, i.seconds, _a_priori(i.a_priori), sensor_named(i.sensor).bias, i.released) for i in images
     )
-    return ImageSet(tuple(i.image_id for i in images), tuple(i.sensor for i in images), packed, priors, ellipsoid)
+    return ImageSet(tuple(i.image_id for i in images), tuple(i.sensor for i in images), packed, priors, ellipsoid, parameters)

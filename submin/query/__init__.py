@@ -1,0 +1,1 @@
+"""Control sets, and the policies that merge sub-MINs into one answer."""

@@ -84,13 +84,10 @@ def points_of_tile(source: NetworkSource, number: int) -> list[Selection]:
     return [s for s in (Selection(cell, np.flatnonzero(_determined(cell))) for cell in cells) if len(s.rows)]
 
 
-def points_named(source: NetworkSource, ids: NDArray[np.str_], cells: Rows) -> list[Selection]:
-    """Points by id, with the cell (n,) where the directory says that each is.
+def points_named(source: NetworkSource, ids: NDArray[np.str_], cells: Rows) -> tuple[list[Selection], NDArray[np.str_]]:
+    """Points by id, with the cell (n,) where the directory says that each is; and the ids of those that cannot be answered for.
 
-    Raises
-    ------
-    QueryError
-        Naming the points that are not in the network, or whose rays do not determine them yet.
+    A point that is not in the network, or that its rays do not determine yet, cannot.
     """
     found = np.zeros(len(ids), dtype=bool)
     selections = []
@@ -101,13 +98,7 @@ def points_named(source: NetworkSource, ids: NDArray[np.str_], cells: Rows) -> l
         held = (cell.point_ids[row] == ids[wanted]) & _determined(cell)[row] if len(cell) else np.zeros(len(wanted), dtype=bool)
         found[wanted[held]] = True
         selections.append(Selection(cell, np.unique(row[held])))
-    if not found.all():
-        missing = ids[~found]
-        raise QueryError(
-            f"{len(missing)} of {len(ids)} points are not in the network or not yet determined by two rays: "
-            f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
-        )
-    return [s for s in selections if len(s.rows)]
+    return [s for s in selections if len(s.rows)], ids[~found]
 
 
 def cells_near(source: NetworkSource, area: BaseGeometry) -> list[int]:
@@ -133,7 +124,7 @@ def well_spread(selections: Sequence[Selection], most: int) -> list[Selection]:
     if total <= most:
         return list(selections)
     at = np.concatenate([s.cell.linearised_at[s.rows] for s in selections])
-    rays = np.concatenate([_ray_counts(s.cell)[s.rows] for s in selections])
+    rays = np.concatenate([ray_counts(s.cell)[s.rows] for s in selections])
     ids = np.concatenate([s.cell.point_ids[s.rows] for s in selections])
     order = np.lexsort((ids, -rays))
     low, high = 0.0, float(np.ptp(at, axis=0).max()) + 1.0
@@ -170,7 +161,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     kept: list[Selection] = []
     parts: list[GroundPart] = []
     for selection in selections:
-        kept_selection, part = _ground_part(source, selection)
+        kept_selection, part = ground_part(source, selection)
         if len(kept_selection.rows):
             kept.append(kept_selection)
             parts.append(part)
@@ -194,7 +185,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
         np.concatenate([locate(part, state) for part in parts])[order],
         joint_covariance(loading, own, state.covariance),
         np.concatenate([np.full(len(s.rows), source.cover.owner(s.cell.number)) for s in kept])[order],
-        np.concatenate([_ray_counts(s.cell)[s.rows] for s in kept])[order],
+        np.concatenate([ray_counts(s.cell)[s.rows] for s in kept])[order],
         policy, tuple(tiles), state.images,
         policy != "ci" and held.issuperset(source.cell_numbers()),
     )  # fmt: skip
@@ -222,14 +213,14 @@ def _choose(source: NetworkSource, selections: Sequence[Selection], policy: str,
     return ("rigorous" if policy == "auto" else policy), sorted({t for cell in cells for t in cover.holders(cell)})
 
 
-def _ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection, GroundPart]:
+def ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection, GroundPart]:
     """Own parts and loadings of the selected points; those of deficient rank are left out."""
     cell = selection.cell
     images = source.image_set(cell.images)
     linear, point_factors = factors(cell, images, selection.rows)
     good = point_factors.rank == 3
     if not good.all():
-        return _ground_part(source, Selection(cell, selection.rows[good]))
+        return ground_part(source, Selection(cell, selection.rows[good]))
     rows = cell.images[linear.image]
     part = GroundPart(
         cell.origin[selection.rows],
@@ -239,9 +230,10 @@ def _ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection
     return selection, part
 
 
-def _ray_counts(cell: Cell) -> Rows:
+def ray_counts(cell: Cell) -> Rows:
+    """Accepted rays (n,) of each of the cell's points."""
     return np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell))
 
 
 def _determined(cell: Cell) -> NDArray[np.bool_]:
-    return _ray_counts(cell) >= 2
+    return ray_counts(cell) >= 2

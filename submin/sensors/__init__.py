@@ -6,6 +6,9 @@ from submin.sensors.rpc import RpcSensor
 
 SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in (RpcSensor(),)}
 
+WIDEST = max(sensor.parameters for sensor in SENSORS.values())
+"""Adjustable parameters of the sensor that has most of them; images of the others are padded with parameters of zero partial."""
+
 
 def sensor_named(name: str) -> Sensor:
     """The sensor model of that name; raises `InputError` for an unknown one."""
@@ -15,4 +18,4 @@ def sensor_named(name: str) -> Sensor:
         raise InputError(f"sensor is {name!r}; expected one of {', '.join(sorted(SENSORS))}") from None
 
 
-__all__ = ["SENSORS", "Ground", "Projection", "Sensor", "sensor_named"]
+__all__ = ["SENSORS", "WIDEST", "Ground", "Projection", "Sensor", "sensor_named"]

@@ -1,0 +1,1 @@
+"""Catalogues and networks on disk."""

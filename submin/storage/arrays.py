@@ -10,10 +10,33 @@ import pyarrow as pa
 import zarr
 from numpy.typing import NDArray
 
+from submin.errors import StoreError
+
 AnyArray = NDArray[Any]
 
 REALS_CHUNK = 1 << 17
 TABLE_CHUNK = 1 << 16
+
+
+def group_of(parent: zarr.Group, name: str) -> zarr.Group:
+    """A group inside another; raises `StoreError` when the store is damaged."""
+    found = parent[name] if name in parent else None
+    if not isinstance(found, zarr.Group):
+        raise StoreError(f"the store has no group {name!r}; it is damaged, or not a network")
+    return found
+
+
+def array_of(group: zarr.Group, name: str) -> zarr.Array[Any]:
+    """An array of a group; raises `StoreError` when the store is damaged."""
+    found = group[name] if name in group else None
+    if not isinstance(found, zarr.Array):
+        raise StoreError(f"the store has no array {name!r} in {group.path!r}; it is damaged")
+    return found
+
+
+def attributes_of(group: zarr.Group) -> dict[str, Any]:
+    """All attributes of a group."""
+    return dict(group.attrs.asdict())
 
 
 def encode_text(values: AnyArray) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
@@ -66,13 +89,13 @@ def write_record(parent: zarr.Group, name: str, parts: Mapping[str, AnyArray], a
 def read_record(group: zarr.Group, wanted: Iterable[str] | None = None) -> dict[str, AnyArray]:
     """Named arrays of a record: all, or only those wanted."""
     names = None if wanted is None else set(wanted)
-    chosen = [entry for entry in group.attrs["layout"] if names is None or str(entry[0]).removesuffix(".ends") in names]
+    chosen = [entry for entry in attributes_of(group)["layout"] if names is None or str(entry[0]).removesuffix(".ends") in names]
     spans: dict[str, tuple[int, int]] = {}
     for _, kind, start, shape in chosen:
         stop = start + int(np.prod(shape))
         low, high = spans.get(kind, (start, stop))
         spans[kind] = (min(low, start), max(high, stop))
-    data = {kind: group[kind][low:high] if high > low else np.empty(0) for kind, (low, high) in spans.items()}
+    data = {kind: np.asarray(array_of(group, kind)[low:high]) if high > low else np.empty(0) for kind, (low, high) in spans.items()}
     parts: dict[str, AnyArray] = {}
     for part, kind, start, shape in chosen:
         at = start - spans[kind][0]
@@ -98,13 +121,13 @@ def create_table(parent: zarr.Group, name: str, columns: Mapping[str, str]) -> z
 
 def table_length(group: zarr.Group) -> int:
     """Number of rows."""
-    column, kind = next(iter(group.attrs["columns"].items()))
-    return int(group[column + ".ends" if kind == "text" else column].shape[0])
+    column, kind = next(iter(attributes_of(group)["columns"].items()))
+    return array_of(group, column + ".ends" if kind == "text" else column).shape[0]
 
 
 def append_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
     """Append rows; every column of the table must be given."""
-    kinds = group.attrs["columns"]
+    kinds = attributes_of(group)["columns"]
     if set(kinds) != set(columns):
         raise ValueError(f"columns are {sorted(columns)}; expected {sorted(kinds)}")
     for column, values in columns.items():
@@ -112,26 +135,26 @@ def append_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
             continue
         if kinds[column] == "text":
             data, ends = encode_text(values)
-            base = group[column].shape[0]
+            base = array_of(group, column).shape[0]
             if data.size:
-                group[column].append(data)
-            group[column + ".ends"].append(ends + base)
+                array_of(group, column).append(data)
+            array_of(group, column + ".ends").append(ends + base)
         else:
-            group[column].append(values.astype(kinds[column]))
+            array_of(group, column).append(values.astype(kinds[column]))
 
 
 def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: int = 0, stop: int | None = None) -> dict[str, AnyArray]:
     """Columns of the rows from ``start`` to before ``stop``."""
-    kinds = group.attrs["columns"]
+    kinds = attributes_of(group)["columns"]
     columns: dict[str, AnyArray] = {}
     for column in kinds if wanted is None else wanted:
         if kinds[column] != "text":
-            columns[column] = group[column][start:stop]
+            columns[column] = np.asarray(array_of(group, column)[start:stop])
             continue
-        ends = group[column + ".ends"][max(start - 1, 0) : stop]
+        ends = np.asarray(array_of(group, column + ".ends")[max(start - 1, 0) : stop])
         base = int(ends[0]) if start > 0 and len(ends) else 0
         ends = ends[1:] if start > 0 else ends
-        data = group[column][base : int(ends[-1])] if len(ends) else np.empty(0, dtype=np.uint8)
+        data = np.asarray(array_of(group, column)[base : int(ends[-1])]) if len(ends) else np.empty(0, dtype=np.uint8)
         columns[column] = decode_text(data, ends - base)
     return columns
 
@@ -139,7 +162,7 @@ def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: in
 def set_rows(group: zarr.Group, column: str, rows: NDArray[np.int64], values: AnyArray) -> None:
     """Change some rows of a column that is not text."""
     if len(rows):
-        group[column].oindex[rows] = values
+        array_of(group, column).oindex[rows] = values
 
 
 _FNV_OFFSET, _FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)

@@ -17,8 +17,9 @@ import pyarrow.parquet as pq
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError
+from submin.formats.columns import Column
 from submin.formats.tables import covariance_rows
-from submin.storage.catalogue import IMAGE_COLUMNS, MEASUREMENT_COLUMNS, Column
+from submin.storage.catalogue import IMAGE_COLUMNS, MEASUREMENT_COLUMNS
 from submin.storage.catalogue_schema import COVARIANCE_COLUMNS, POINT_KINDS, Block, CatalogueMetadata, ImageRecord, PointTable
 
 GROUP_ROWS = 1 << 17

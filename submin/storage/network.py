@@ -19,7 +19,7 @@ from submin.network.network_image import image_set
 from submin.network.sub_min import SubMin
 from submin.query.control_set import ControlSet
 from submin.query.planner import Answer, answer, points_in_area, points_named, points_of_tile, well_spread
-from submin.storage.arrays import read_record
+from submin.storage.arrays import group_of, read_record
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
 from submin.tiling.cover import Cover
@@ -93,12 +93,17 @@ class Network:
             raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
         number = None if tile is None else self.cover.tile_number(tile)
         if bbox is not None:
-            area = _box(bbox)
+            area = box_area(bbox)
         if area is not None:
             selections = points_in_area(self, area)
         elif points is not None:
             ids = np.unique(np.asarray(points, dtype=np.str_))
-            selections = points_named(self, ids, self._snapshot.candidate_cells(ids))
+            selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids))
+            if len(missing):
+                raise QueryError(
+                    f"{len(missing)} of {len(ids)} points are not in the network or not yet determined by two rays: "
+                    f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+                )
         else:
             assert number is not None
             selections = points_of_tile(self, number)
@@ -108,6 +113,12 @@ class Network:
         if max_points is not None:
             selections = well_spread(selections, max_points)
         return self._control_set(answer(self, selections, policy, number))
+
+    def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
+        """Those of some points that the network can answer for, by their cell."""
+        ids = np.unique(np.asarray(points, dtype=np.str_))
+        selections, _ = points_named(self, ids, self._snapshot.candidate_cells(ids))
+        return {s.cell.number: s.cell.point_ids[s.rows] for s in selections}
 
     def tile(self, name: str) -> TileView:
         """One sub-MIN alone."""
@@ -135,7 +146,7 @@ class Network:
 
     def cell_sums(self, number: int) -> tuple[Index, Sums]:
         """A cell's images and sums."""
-        group = self._snapshot.root["cells/" + self.cover.cell_name(number)]
+        group = group_of(self._snapshot.root, "cells/" + self.cover.cell_name(number))
         parts = read_record(group, ["images", "vector", "information"])
         return parts["images"].astype(np.int32), read_sums_of(group, parts)
 
@@ -147,7 +158,7 @@ class Network:
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         """Images of these rows."""
-        return image_set(self._snapshot.images(rows), self._snapshot.metadata.ellipsoid)
+        return image_set(self._snapshot.images(rows), self._snapshot.metadata.ellipsoid, snapshot.metadata.parameters)
 
     def _control_set(self, found: Answer) -> ControlSet:
         metadata, cover = self._snapshot.metadata, self.cover
@@ -189,7 +200,14 @@ class TileView:
         return self.query(ids).covariance
 
 
-def _box(bbox: tuple[float, float, float, float]) -> BaseGeometry:
+def box_area(bbox: tuple[float, float, float, float]) -> BaseGeometry:
+    """Area of a box: west, south, east, north in degrees; west above east means across the antimeridian.
+
+    Raises
+    ------
+    QueryError
+        When the numbers are no box on a globe.
+    """
     west, south, east, north = bbox
     if not (np.isfinite(bbox).all() and -90.0 <= south < north <= 90.0 and -180.0 <= west <= 180.0 and -180.0 <= east <= 180.0):
         swapped = -90.0 <= west < east <= 90.0 and abs(south) > 90.0

@@ -17,7 +17,7 @@ from submin.errors import ConflictError, QueryError, StoreError
 from submin.network.cell import Cell, empty_cell
 from submin.network.network_image import NetworkImage
 from submin.network.sub_min import SubMin
-from submin.storage.arrays import create_table, hash_ids, read_record, read_table, table_length
+from submin.storage.arrays import attributes_of, create_table, group_of, hash_ids, read_record, read_table, table_length
 from submin.storage.schema import (
     DIRECTORY_COLUMNS,
     IMAGE_COLUMNS,
@@ -105,9 +105,9 @@ class Snapshot:
     def __init__(self, root: zarr.Group, place: str) -> None:
         self.root = root
         self.place = place
-        self.metadata = NetworkMetadata.from_attributes(root.attrs, place)
+        self.metadata = NetworkMetadata.from_attributes(attributes_of(root), place)
         self.cover = Cover.from_mapping(self.metadata.cover)
-        self.number = int(root.attrs["version"])
+        self.number = int(attributes_of(root)["version"])
 
     @classmethod
     def open(cls, place: str, version: str | None = None) -> Snapshot:
@@ -142,35 +142,35 @@ class Snapshot:
         name = "cells/" + self.cover.cell_name(number)
         if name not in self.root:
             return empty_cell(number, self.metadata.parameters)
-        return read_cell(self.root[name], with_sums=with_sums)
+        return read_cell(group_of(self.root, name), with_sums=with_sums)
 
     def cell_numbers(self) -> tuple[int, ...]:
         """Cells that hold points or rays, ascending."""
-        return tuple(sorted(self.cover.cell_number(name) for name in self.root["cells"].group_keys()))
+        return tuple(sorted(self.cover.cell_number(name) for name in group_of(self.root, "cells").group_keys()))
 
     def cell_attributes(self, number: int) -> dict[str, Any]:
         """Counts of a cell, without reading it."""
-        return dict(self.root["cells/" + self.cover.cell_name(number)].attrs)
+        return attributes_of(group_of(self.root, "cells/" + self.cover.cell_name(number)))
 
     def tile_numbers(self) -> tuple[int, ...]:
         """Tiles that have a sub-MIN, ascending."""
-        return tuple(sorted(self.cover.tile_number(name) for name in self.root["tiles"].group_keys()))
+        return tuple(sorted(self.cover.tile_number(name) for name in group_of(self.root, "tiles").group_keys()))
 
     def sub_min(self, tile: int, images: NDArray[np.int32] | None = None) -> SubMin:
         """A tile's sub-MIN, or its marginal on some images."""
-        return read_sub_min(self.root["tiles/" + self.cover.tile_name(tile)], images)
+        return read_sub_min(group_of(self.root, "tiles/" + self.cover.tile_name(tile)), images)
 
     def tile_images(self, tile: int) -> NDArray[np.int32]:
         """Rows of the images that a tile sees."""
-        return np.asarray(read_record(self.root["tiles/" + self.cover.tile_name(tile)], ["images"])["images"], dtype=np.int32)
+        return np.asarray(read_record(group_of(self.root, "tiles/" + self.cover.tile_name(tile)), ["images"])["images"], dtype=np.int32)
 
     def image_count(self) -> int:
         """Number of images in the network."""
-        return table_length(self.root["images"])
+        return table_length(group_of(self.root, "images"))
 
     def images(self, rows: Sequence[int] | NDArray[np.integer] | None = None) -> list[NetworkImage]:
         """Images of these rows (ascending), or all."""
-        table, wanted = self.root["images"], [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")]
+        table, wanted = group_of(self.root, "images"), [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")]
         if rows is None:
             return network_images(read_table(table, wanted))
         if not len(rows):
@@ -181,15 +181,15 @@ class Snapshot:
 
     def image_columns(self, wanted: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns of the image table."""
-        return read_table(self.root["images"], wanted)
+        return read_table(group_of(self.root, "images"), wanted)
 
     def ledger(self, wanted: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
         """Columns of the ledger of blocks; a block's last row counts."""
-        return read_table(self.root["ledger"], wanted)
+        return read_table(group_of(self.root, "ledger"), wanted)
 
     def candidate_cells(self, point_ids: NDArray[np.str_]) -> NDArray[np.int64]:
         """Cell (n,) in which each point would be, by the directory; -1 for points that are not in the network."""
-        directory = read_table(self.root["directory"])
+        directory = read_table(group_of(self.root, "directory"))
         cells = np.full(len(point_ids), -1, dtype=np.int64)
         if not len(directory["hash"]) or not len(point_ids):
             return cells

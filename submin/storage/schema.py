@@ -18,7 +18,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell
 from submin.network.network_image import NetworkImage
 from submin.network.sub_min import SubMin
-from submin.storage.arrays import read_record, write_record
+from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
 
 FORMAT_VERSION = 1
 COVARIANCE_CHUNK = 256
@@ -95,18 +95,19 @@ def unpack_lower(packed: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
-def write_cell(root: zarr.Group, name: str, cell: Cell) -> None:
-    """Write a cell, replacing its earlier state."""
+def write_cell(root: zarr.Group, name: str, cell: Cell, square_px: float) -> None:
+    """Write a cell, replacing its earlier state; ``square_px`` is the sum of its accepted rays' squared residuals, pixels squared."""
     rays, sums = cell.rays, cell.sums
     write_record(
-        root["cells"], name,
+        group_of(root, "cells"), name,
         {
             "point_ids": cell.point_ids, "final": cell.final, "ray_point": rays.point, "ray_image": rays.image, "accepted": rays.accepted,
             "images": cell.images, "origin": cell.origin, "linearised_at": cell.linearised_at, "theta": cell.theta,
             "observed": rays.observed, "sigma": rays.sigma, "vector": sums.vector, "information": pack_lower(sums.information),
         },
         {"number": cell.number, "misclosure": sums.misclosure, "redundancy": sums.redundancy,
-         "points": len(cell.point_ids), "determined": int(determined(cell).sum()), "rays": len(rays), "accepted": int(rays.accepted.sum())},
+         "points": len(cell.point_ids), "determined": int(determined(cell).sum()), "rays": len(rays), "accepted": int(rays.accepted.sum()),
+         "square_px": square_px},
     )  # fmt: skip
 
 
@@ -127,22 +128,21 @@ def read_cell(group: zarr.Group, *, with_sums: bool = True) -> Cell:
     )  # fmt: skip
     sums = read_sums_of(group, parts) if with_sums else Sums(np.empty((0, 0)), np.empty(0), 0.0, 0)
     return Cell(
-        int(group.attrs["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"], parts["final"].astype(np.bool_),
+        int(attributes_of(group)["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"], parts["final"].astype(np.bool_),
         parts["images"].astype(np.int32), parts["theta"], rays, sums,
     )  # fmt: skip
 
 
 def read_sums_of(group: zarr.Group, parts: dict[str, NDArray[Any]]) -> Sums:
     """Sums among the parts of a cell's record."""
-    return Sums(
-        unpack_lower(parts["information"]), parts["vector"], float(group.attrs["misclosure"]), int(group.attrs["redundancy"])
-    )  # fmt: skip
+    attributes = attributes_of(group)
+    return Sums(unpack_lower(parts["information"]), parts["vector"], float(attributes["misclosure"]), int(attributes["redundancy"]))
 
 
 def write_sub_min(root: zarr.Group, name: str, sub_min: SubMin, cells: Sequence[int]) -> None:
     """Write a tile's sub-MIN, replacing its earlier state; of the covariance only blocks on and below the diagonal."""
     group = write_record(
-        root["tiles"], name,
+        group_of(root, "tiles"), name,
         {"images": sub_min.images, "cells": np.array(cells, dtype=np.int64), "theta": sub_min.theta},
         {"chi_square": sub_min.chi_square, "redundancy": sub_min.redundancy},
     )  # fmt: skip
@@ -160,11 +160,12 @@ def read_sub_min(group: zarr.Group, images: NDArray[np.int32] | None = None) -> 
     chosen = np.arange(len(held)) if images is None else np.flatnonzero(np.isin(held, images))
     p = theta.shape[1]
     rows = (chosen[:, None] * p + np.arange(p)).ravel()
-    array = group["covariance"]
-    covariance = array[:, :] if len(chosen) == len(held) else array.oindex[rows, rows]
+    array = array_of(group, "covariance")
+    covariance = np.asarray(array[:, :] if len(chosen) == len(held) else array.oindex[rows, rows])
+    attributes = attributes_of(group)
     return SubMin(
         held[chosen], theta[chosen], fill_symmetric(np.ascontiguousarray(covariance)),
-        float(group.attrs["chi_square"]), int(group.attrs["redundancy"]),
+        float(attributes["chi_square"]), int(attributes["redundancy"]),
     )  # fmt: skip
 
 

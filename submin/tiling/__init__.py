@@ -1,0 +1,1 @@
+"""Overlapping tiles over an area, and the cells that they cut."""

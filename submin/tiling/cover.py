@@ -181,7 +181,7 @@ class Cover:
         """Distance (n,) in metres from positions to the tile's outline, positive inside; rim sides are infinitely far."""
         west, south, east, north = self._bounds(tile, 0.5 * self.overlap, open_rim=True)
         x, y = self.plane(longitude, latitude)
-        return np.minimum.reduce([x - west, east - x, y - south, north - y])
+        return np.asarray(np.minimum.reduce([x - west, east - x, y - south, north - y]))
 
     def _bounds(self, tile: int, widen: float, *, open_rim: bool = False) -> tuple[float, float, float, float]:
         row, column = divmod(int(tile), self.columns)

@@ -15,9 +15,9 @@ import shapely
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
-from submin.formats.rpc_import import ImportSummary, import_rpc
 from submin.sensors import sensor_named
 from submin.storage.catalogue import Block, Catalogue, defects
+from submin.storage.rpc_import import ImportSummary, import_rpc
 
 FOLDERS = {"wv3_jax068": "rpc_raw", "pleiades_provence_triplet": "rpc", "pleiades_ventoux_pair": "rpc"}
 
@@ -105,8 +105,8 @@ def rays_miss_m(block: Block, height: float) -> float:
     [("wv3_jax068", -20.0, 3.0), ("pleiades_provence_triplet", 180.0, 15.0), ("pleiades_ventoux_pair", 535.0, 10.0)],
 )
 def test_tracks_are_in_the_frame_of_the_cameras(data: Path, tmp_path: Path, name: str, height: float, limit: float) -> None:
-    """At the height of the ground (PROVENANCE) rays of one point meet but for relief and raw biases; with sample and line exchanged, or each
-    crop counted from its own corner, they do not."""
+    """At the height of the ground (PROVENANCE) rays of one point meet but for relief and raw biases; with sample and line exchanged, or
+    each crop counted from its own corner, they do not."""
     run(data / name, tmp_path / "c", blocks="all")
     block = next(Catalogue.open(tmp_path / "c").blocks())
     assert rays_miss_m(block, height) < limit

@@ -17,11 +17,12 @@ import shapely
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
+from submin.formats import columns as reading
 from submin.geodesy import local_axes, rotate_covariance
-from submin.storage import catalogue as reading
-from submin.storage.catalogue import Block, Catalogue, CatalogueMetadata, ImageRecord, PointTable, defects, read_point_table
+from submin.storage.catalogue import Block, Catalogue, CatalogueMetadata, ImageRecord, PointTable, defects
 from submin.storage.catalogue_schema import parse_utc
 from submin.storage.catalogue_writer import CatalogueWriter
+from submin.storage.point_table import read_point_table
 
 FOOTPRINT = shapely.to_wkb(shapely.box(10.0, 50.0, 10.1, 50.1))
 

@@ -1,6 +1,7 @@
 """Import of images with RPCs and measured tie points into a catalogue.
 
-Three inputs: a table of images, a folder of RPC files, and tracks, a row a ray: ``track_id, image_id, col, row`` in the pixel frame of the image's RPC.
+Three inputs: a table of images, a folder of RPC files, and tracks, a row a ray: ``track_id, image_id, col, row`` in the pixel frame of
+the image's RPC.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ import shapely
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
+from submin.formats.columns import integer, number, read_table, text
 from submin.formats.rpc_files import read_rpc
 from submin.sensors import sensor_named
-from submin.storage.catalogue import integer, number, read_table, text
 from submin.storage.catalogue_schema import (
     DEFAULT_SIGMA_PX,
     Array,
@@ -238,7 +239,8 @@ def _read_tracks(path: Path, images_file: Path, listed: Sequence[_Listed]) -> _T
     if repeated is not None:
         earlier, k = repeated
         raise CatalogueError(
-            f"{path}: row {k + 1}: track {str(track_ids[k])!r} is in image {listed[image[k]].image_id!r} as in row {earlier + 1}; expected one ray"
+            f"{path}: row {k + 1}: track {str(track_ids[k])!r} is in image {listed[image[k]].image_id!r} as in row {earlier + 1}; "
+            "expected one ray"
         )
     return _Tracks(track_ids, image, col, row)
 
@@ -257,7 +259,8 @@ def _pass_ids(listed: Sequence[_Listed], dataset: str, notes: list[str]) -> list
         for i in untimed:
             pass_ids[i] = f"{dataset}-pass"
         notes.append(
-            f"neither pass_id nor acquisition_utc is known of {len(untimed)} images of {len(listed)}: they are taken as one pass, {dataset}-pass"
+            f"neither pass_id nor acquisition_utc is known of {len(untimed)} images of {len(listed)}: "
+            f"they are taken as one pass, {dataset}-pass"
         )
     return pass_ids
 
@@ -303,9 +306,8 @@ def _records(
         notes.append(f"some tracks lie outside the image, so check col0, row0, width, height: {_named(outside)}")
     footprints = _footprints(records)
     if b"" in footprints:
-        notes.append(
-            f"no footprint, because the RPC cannot be inverted: {_named(r.image_id for r, f in zip(records, footprints, strict=True) if not f)}"
-        )
+        without = (record.image_id for record, footprint in zip(records, footprints, strict=True) if not footprint)
+        notes.append(f"no footprint, because the RPC cannot be inverted: {_named(without)}")
     return [replace(record, footprint=footprint) for record, footprint in zip(records, footprints, strict=True)]
 
 
@@ -319,7 +321,7 @@ def _rpc_path(images_file: Path, rpc_folder: Path, image: _Listed) -> Path:
 
 
 def _footprints(records: Sequence[ImageRecord]) -> list[bytes]:
-    """Polygons (WKB, degrees) of the images' outer pixel edges on the ground at each camera's mean height; empty where there is no ground."""
+    """Polygons (WKB, degrees) of the images' outer pixel edges at each camera's mean height; empty where there is no ground."""
     sensor = sensor_named("rpc")
     cameras = np.stack([record.pack() for record in records])
     first = np.array([json.loads(record.camera)["origin"] for record in records])

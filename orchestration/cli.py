@@ -1,0 +1,335 @@
+"""The command line: ``submin COMMAND``.
+
+Exit codes: 0 done; 1 done in part (some blocks rejected; each is named with its reason); 2 wrong usage or bad input, nothing written.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from submin.errors import SubminError
+
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich",
+    help="Ground-control networks for a continent: blocks of satellite images in, control points with joint covariance out.",
+)  # fmt: skip
+import_app = typer.Typer(no_args_is_help=True, help="Make a catalogue from other files.")
+simulate_app = typer.Typer(no_args_is_help=True, help="Make a catalogue of simulated images, with truth.")
+app.add_typer(import_app, name="import")
+app.add_typer(simulate_app, name="simulate")
+
+out = Console(highlight=False)
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+Box = Annotated[tuple[float, float, float, float] | None, typer.Option("--bbox", metavar="W S E N", help="West, south, east, north in degrees.")]
+Aoi = Annotated[Path | None, typer.Option("--aoi", help="GeoJSON file with the area.")]
+Workers = Annotated[int, typer.Option("--workers", min=0, help="Processes of a local Dask cluster; 0 runs without one.")]
+Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")]
+
+
+def show(values: dict[str, Any], as_json: bool, text: str) -> None:
+    """One JSON object, or text for people."""
+    if as_json:
+        sys.stdout.write(json.dumps(values) + "\n")
+    elif text:
+        out.print(text, soft_wrap=True)
+
+
+@import_app.command("rpc")
+def import_rpc_command(
+    images: Annotated[Path, typer.Option("--images", help="CSV with image_id and, where known, acquisition_utc, width, height, col0, row0, rpc.")],
+    rpc: Annotated[Path, typer.Option("--rpc", help="Folder of the RPC files.")],
+    tracks: Annotated[Path, typer.Option("--tracks", help="CSV with track_id, image_id, col, row.")],
+    catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")],
+    blocks: Annotated[str, typer.Option("--blocks", help="What becomes a block: pass, image or all.")] = "pass",
+    dataset: Annotated[str | None, typer.Option("--dataset", help="Prefix of the point ids; default: the folder of the CSV.")] = None,
+    shared_ids: Annotated[bool, typer.Option("--shared-ids", help="Keep track ids as global point ids.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a catalogue from RPC files and tie tracks.
+
+    Example: submin import rpc --images images.csv --rpc rpc --tracks tracks.csv.gz --blocks pass --out catalogue
+    """
+    from submin.storage.rpc_import import import_rpc
+
+    if blocks not in ("pass", "image", "all"):
+        raise typer.BadParameter(f"{blocks!r}; expected pass, image or all", param_hint="--blocks")
+    made = import_rpc(images, rpc, tracks, catalogue, blocks=blocks, dataset=dataset, shared_ids=shared_ids)  # type: ignore[arg-type]
+    values = {
+        "catalogue": str(catalogue), "dataset": made.dataset, "blocks": made.blocks, "passes": made.passes, "images": made.images,
+        "points": made.points, "rays": made.rays, "notes": list(made.notes),
+    }  # fmt: skip
+    text = f"{catalogue}: {made.images} images in {made.blocks} blocks of {made.passes} passes, {made.points:,} points, {made.rays:,} rays"
+    show(values, as_json, "\n".join([text, *(f"note: {note}" for note in made.notes)]))
+
+
+@simulate_app.command("region")
+def simulate_region_command(
+    catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")],
+    scale: Annotated[float, typer.Option("--scale", help="Part of the 400 km x 400 km in area.")] = 1.0,
+    seed: Annotated[int, typer.Option("--seed", help="Of the random numbers; the same seed gives the same catalogue.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate three-line triplets over a region: some 150 blocks, 0.2 % blunders, one bad camera.
+
+    Example: submin simulate region --out catalogue --scale 0.25
+    """
+    from submin.errors import InputError
+    from submin.simulation.region import RegionDesign, simulate_region
+    from submin.storage.simulated import write_region
+
+    if not 0.01 <= scale <= 100.0:
+        raise InputError(f"--scale is {scale:g}; expected 0.01 to 100")
+    side = 400.0 * scale**0.5
+    region = simulate_region(RegionDesign(width_km=side, height_km=side, seed=seed))
+    write_region(region, catalogue)
+    values = {
+        "catalogue": str(catalogue), "simulated": True, "images": len(region.images), "blocks": len({i.block_id for i in region.images}),
+        "points": len(region.point_ids), "rays": len(region.image), "blunders": int(region.blunder.sum()), "bad_cameras": list(region.bad_cameras),
+    }  # fmt: skip
+    show(values, as_json, f"{catalogue}: simulated {values['images']} images in {values['blocks']} blocks, {values['points']:,} points, "
+         f"{values['rays']:,} rays, of which {values['blunders']} blunders; bad camera: {', '.join(region.bad_cameras)}")  # fmt: skip
+
+
+@app.command()
+def create(
+    network: Annotated[str, typer.Argument(help="Folder or s3:// URL of the new network.")],
+    bbox: Box = None,
+    aoi: Aoi = None,
+    fit: Annotated[Path | None, typer.Option("--fit", help="Catalogue whose footprints give the area, and tile sizes that suit them.")] = None,
+    tile_km: Annotated[float | None, typer.Option("--tile-km", help="Side of a core; default 100, or 4 footprints with --fit.")] = None,
+    overlap_km: Annotated[float | None, typer.Option("--overlap-km", help="Width that neighbours share, below the core's.")] = None,
+    form: Annotated[str, typer.Option("--form", help="Form of the sub-MINs.")] = "factored",
+    frame: Annotated[str, typer.Option("--frame", help="Frame of the coordinates; with --fit the catalogue's.")] = "WGS84",
+    epoch: Annotated[str, typer.Option("--epoch", help="Epoch of the frame; with --fit the catalogue's.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Make an empty network over an area.
+
+    Example: submin create network --bbox 97 33 103 37 --tile-km 100 --overlap-km 50
+    """
+    from orchestration.create import create as make
+    from orchestration.create import fit_catalogue, read_area
+    from submin.errors import InputError
+    from submin.storage.catalogue import Catalogue
+    from submin.storage.catalogue_schema import CatalogueMetadata
+    from submin.storage.network import box_area
+
+    if sum(value is not None for value in (bbox, aoi, fit)) != 1:
+        raise InputError("give the area by exactly one of --bbox, --aoi and --fit")
+    metadata = CatalogueMetadata(name="network", frame=frame, epoch=epoch)
+    if fit is not None:
+        fitted = Catalogue.open(fit)
+        area, core, shared = fit_catalogue(fitted)
+        metadata, tile_km = fitted.metadata, core if tile_km is None else tile_km
+        overlap_km = min(shared, 0.5 * tile_km) if overlap_km is None else overlap_km
+    else:
+        area = box_area(bbox) if bbox is not None else read_area(aoi)  # type: ignore[arg-type]
+    made = make(network, area, metadata, tile_km, overlap_km, form)
+    cover = made.cover
+    show(made.to_json(), as_json, f"{network}: {cover.rows} x {cover.columns} tiles, cores of {cover.core / 1000:g} km, "
+         f"overlap {cover.overlap / 1000:g} km, frame {metadata.frame}")  # fmt: skip
+
+
+@app.command()
+def run(
+    catalogue: Annotated[Path, typer.Argument(help="Catalogue of image blocks.")],
+    network: Annotated[str, typer.Argument(help="Network that takes them.")],
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    batch_blocks: Annotated[int, typer.Option("--batch-blocks", min=1, help="Blocks that one commit holds.")] = 500,
+    sequential: Annotated[bool, typer.Option("--sequential", help="Fuse block by block, in the order of the catalogue.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Fuse every block of a catalogue that the network does not have yet. The same command again continues, or says that nothing is left.
+
+    Example: submin run catalogue network --workers 2
+    """
+    from orchestration.executors import executor_for
+    from orchestration.progress import progress_bars
+    from orchestration.run import run as fuse
+    from submin.storage.catalogue import Catalogue
+
+    opened = Catalogue.open(catalogue)
+    with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+        result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
+    lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
+    if result.rays_used:
+        lines.append(
+            f"{result.rays_used:,} rays used, {result.rays_rejected:,} rejected as blunders, RMS {result.ray_rms_px:.3f} px; "
+            f"{result.seconds:.1f} s, {result.peak_memory_mb:.0f} MB"
+        )
+    elif not result.rejected:
+        lines.append("nothing is left to do")
+    lines += [f"bad camera {f.image_id}: {f.reason}" for f in result.flagged]
+    lines += [f"rejected block {r.block_id}: {r.reason}" for r in result.rejected]
+    lines += [f"tile {t}: the judgement of its rays did not settle; they are used as last judged" for t in result.unsettled_tiles]
+    show(result.to_json(), as_json, "\n".join(lines))
+    if result.rejected:
+        raise typer.Exit(1)
+
+
+@app.command()
+def query(
+    network: Annotated[str, typer.Argument(help="Network to ask.")],
+    bbox: Box = None,
+    aoi: Aoi = None,
+    points: Annotated[Path | None, typer.Option("--points", help="CSV or Parquet with a column point_id, or text with one id a line.")] = None,
+    tile: Annotated[str | None, typer.Option("--tile", help="Name of a tile: its sub-MIN alone.")] = None,
+    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "auto",
+    at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
+    max_points: Annotated[int | None, typer.Option("--max-points", min=1, help="At most so many points, well spread.")] = None,
+    output: Annotated[Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Control points of an area, with their joint covariance.
+
+    Example: submin query network --bbox 99 34 101 36 --policy rigorous --out control.parquet
+    """
+    import submin
+    from orchestration.create import read_area
+    from orchestration.point_list import read_point_ids
+
+    started = time.monotonic()
+    control = submin.open(network, at).query(
+        bbox=bbox, area=None if aoi is None else read_area(aoi), points=None if points is None else read_point_ids(points),
+        tile=tile, policy=policy, max_points=max_points,
+    )  # fmt: skip
+    if output is not None:
+        control.write(output)
+    seconds = time.monotonic() - started
+    values = {
+        "points": len(control), "policy": control.policy, "tiles": list(control.tiles), "version": control.version, "scope": control.scope,
+        "blocks": len(control.blocks), "seconds": seconds, "out": None if output is None else str(output),
+    }  # fmt: skip
+    if not len(control):
+        show(values, as_json, f"{network} {control.version}: no determined points there")
+        return
+    import numpy as np
+
+    values |= {"ce90_median": float(np.median(control.ce90)), "le90_median": float(np.median(control.le90))}
+    shown = "" if output is None else f"; written to {output}"
+    show(values, as_json, f"{len(control):,} points of {network} {control.version}, policy {control.policy} over {len(control.tiles)} "
+         f"tile{'s' if len(control.tiles) > 1 else ''} (scope: {control.scope}), "
+         f"median CE90 {values['ce90_median']:.3g} m, LE90 {values['le90_median']:.3g} m, {seconds:.2f} s{shown}")  # fmt: skip
+
+
+@app.command()
+def check(
+    network: Annotated[str, typer.Argument(help="Network to check.")],
+    points: Annotated[Path, typer.Argument(help="Table of check points, by the ids of tie points.")],
+    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "rigorous",
+    output: Annotated[Path | None, typer.Option("--out", help="Text file that takes the table too.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare a network with check points: errors, stated accuracy, per cent within it, NEES.
+
+    Example: submin check network catalogue/check.parquet
+    """
+    import submin
+    from orchestration.check import check as compare
+    from submin.storage.point_table import read_point_table
+
+    result = compare(submin.open(network), read_point_table(points), policy)
+    table = Table(title=f"{network} {result.version} against {points.name}, policy {policy}", title_justify="left")
+    headings = ("area", "points", "hor. 50 %", "90 %", "95 %", "mean CE90", "within", "vert. 50 %", "90 %", "95 %", "mean LE90", "within")
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading == "area" else "right", no_wrap=True)
+    for name, a in {"all": result.accuracy, **result.by_area}.items():
+        lengths = (f"{v:.2f} m" for v in (a.horizontal_p50, a.horizontal_p90, a.horizontal_p95, a.mean_ce90))
+        heights = (f"{v:.2f} m" for v in (a.vertical_p50, a.vertical_p90, a.vertical_p95, a.mean_le90))
+        table.add_row(
+            name, f"{a.points:,}", *lengths, f"{a.per_cent_within_ce90:.1f} %", *heights, f"{a.per_cent_within_le90:.1f} %"
+        )  # fmt: skip
+    closing = (
+        f"NEES per degree of freedom {result.nees_per_dof:.4f} (99 % band {result.nees_band[0]:.4f} to {result.nees_band[1]:.4f} "
+        f"when the stated covariance is exact); {result.missing} check points are not determined in the network"
+    )
+    if output is not None:
+        with output.open("w", encoding="utf-8") as stream:
+            plain = Console(file=stream, width=160)
+            plain.print(table)
+            plain.print(closing, soft_wrap=True)
+    if as_json:
+        show(result.to_json(), True, "")
+    else:
+        wide = Console(highlight=False, width=max(out.width, 132))
+        wide.print(table)
+        wide.print(closing, soft_wrap=True)
+
+
+@app.command("map")
+def map_command(
+    network: Annotated[str, typer.Argument(help="Network to draw.")],
+    output: Annotated[Path, typer.Option("--out", help="PNG file to write.")],
+    as_json: Json = False,
+) -> None:
+    """Draw a network: points by CE90, tiles and cells, footprints.
+
+    Example: submin map network --out network.png
+    """
+    import submin
+    from orchestration.network_map import draw_network
+
+    draw_network(submin.open(network), output)
+    show({"out": str(output)}, as_json, f"map written to {output}")
+
+
+@app.command()
+def info(
+    network: Annotated[str, typer.Argument(help="Network to describe.")],
+    at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
+    as_json: Json = False,
+) -> None:
+    """What a network holds.
+
+    Example: submin info network
+    """
+    import submin
+    from orchestration.info import describe
+
+    values = describe(submin.open(network, at))
+    table = Table(show_header=False, box=None)
+    for key, value in values.items():
+        shown = f"{value:,}" if isinstance(value, int) else f"{value:.3g}" if isinstance(value, float) else str(value)
+        table.add_row(key.replace("_", " "), shown)
+    if as_json:
+        show(values, True, "")
+    else:
+        out.print(table)
+
+
+@app.command()
+def history(network: Annotated[str, typer.Argument(help="Network.")], as_json: Json = False) -> None:
+    """Versions of a network, the newest first.
+
+    Example: submin history network
+    """
+    from submin.storage.network_store import versions
+
+    found = versions(network)
+    values = {"versions": [{"version": v.name, "written": v.written.isoformat(), "message": v.message, "snapshot": v.snapshot} for v in found]}
+    show(values, as_json, "\n".join(f"{v.name:>6}  {v.written:%Y-%m-%d %H:%M:%S}  {v.message}" for v in found))
+
+
+def main() -> None:
+    """Run the command line; an error of submin is one line on standard error and exit code 2."""
+    try:
+        app()
+    except SubminError as error:
+        Console(stderr=True, highlight=False, markup=False).print(f"submin: {error}", soft_wrap=True)
+        if "--json" in sys.argv:
+            sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""A new, empty network over an area."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from submin.errors import InputError
+from submin.sensors import WIDEST
+from submin.storage.catalogue import Catalogue
+from submin.storage.catalogue_schema import CatalogueMetadata
+from submin.storage.network_store import create_network
+from submin.storage.schema import NetworkMetadata
+from submin.tiling.cover import Cover, cover_area
+
+DEFAULT_CORE_KM = 100.0
+CORE_IN_FOOTPRINTS = 4.0
+"""With ``--fit`` a core is so many median footprint widths wide, and neighbours share one."""
+
+
+@dataclass(frozen=True)
+class Created:
+    """A network just made."""
+
+    place: str
+    cover: Cover
+    metadata: NetworkMetadata
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "network": self.place, "tiles": self.cover.rows * self.cover.columns, "rows": self.cover.rows, "columns": self.cover.columns,
+            "tile_km": self.cover.core / 1000.0, "overlap_km": self.cover.overlap / 1000.0, "frame": self.metadata.frame, "version": "v0",
+        }  # fmt: skip
+
+
+def create(
+    place: str, area: BaseGeometry, metadata: CatalogueMetadata, tile_km: float | None, overlap_km: float | None, form: str = "factored"
+) -> Created:
+    """Create an empty network over an area (longitude and latitude, degrees).
+
+    Raises
+    ------
+    InputError
+        When the area or the sizes cannot be used; nothing is written then.
+    StoreError
+        When something is already at the place.
+    """
+    if form != "factored":
+        raise InputError(f"form is {form!r}; this release makes 'factored' networks")
+    core = 1000.0 * (DEFAULT_CORE_KM if tile_km is None else tile_km)
+    overlap = 0.25 * core if overlap_km is None else 1000.0 * overlap_km
+    cover = cover_area(area, core, overlap, metadata.ellipsoid)
+    network = NetworkMetadata(
+        name=Path(place).name, body=metadata.body, frame=metadata.frame, epoch=metadata.epoch,
+        semimajor_axis=metadata.semimajor_axis, flattening=metadata.flattening, cover=cover.to_mapping(), form=form,
+        parameters=WIDEST,
+    )  # fmt: skip
+    create_network(place, network)
+    return Created(place, cover, network)
+
+
+def read_area(path: Path) -> BaseGeometry:
+    """Polygons of a GeoJSON file, as one area.
+
+    Raises
+    ------
+    InputError
+        When the file is not GeoJSON or holds no polygon.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        kind = values["type"]
+        features = values["features"] if kind == "FeatureCollection" else [values]
+        shapes = [shapely.from_geojson(json.dumps(f["geometry"] if f["type"] == "Feature" else f)) for f in features]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a GeoJSON file") from None
+    except (ValueError, KeyError, TypeError, shapely.GEOSException) as error:
+        raise InputError(f"{path}: not GeoJSON ({error}); expected a polygon, a feature or a collection of features") from None
+    polygons = [shape for shape in shapes if shape is not None and shape.geom_type in ("Polygon", "MultiPolygon")]
+    if not polygons:
+        raise InputError(f"{path}: holds no polygon; expected the area as Polygon or MultiPolygon in longitude and latitude")
+    broken = [polygon for polygon in polygons if not polygon.is_valid]
+    if broken:
+        raise InputError(f"{path}: the area is not a valid polygon: {shapely.is_valid_reason(broken[0])}; mend it and try again")
+    return shapely.union_all(polygons)
+
+
+def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
+    """Area of a catalogue's footprints, and the core and overlap that suit them, kilometres.
+
+    Raises
+    ------
+    InputError
+        When no image has a footprint.
+    """
+    footprints = [shapely.from_wkb(image.footprint) for image in catalogue.images if image.footprint]
+    if not footprints:
+        raise InputError(f"{catalogue.path}: no image has a footprint (column geometry); give the area by --bbox or --aoi")
+    west, south, east, north = shapely.total_bounds(footprints)
+    bounds = shapely.bounds(footprints)
+    metres_per_degree = np.radians(1.0) * catalogue.metadata.semimajor_axis
+    width = float(np.median((bounds[:, 3] - bounds[:, 1]) * metres_per_degree)) / 1000.0
+    return shapely.box(west, south, east, north), CORE_IN_FOOTPRINTS * width, width

@@ -1,0 +1,40 @@
+"""What a network holds, in a few numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from submin import Network
+from submin.storage.accuracy_map import accuracy_map
+
+
+def describe(network: Network) -> dict[str, Any]:
+    """Numbers of ``submin info``: counts, median accuracy, size."""
+    snapshot = network.snapshot
+    cells = [snapshot.cell_attributes(number) for number in network.cell_numbers()]
+    released = snapshot.image_columns(["image_id", "released"])
+    status = snapshot.ledger(["block_id", "status"])
+    accuracy = accuracy_map(network)
+    place = snapshot.place
+    size = sum(f.stat().st_size for f in Path(place).rglob("*") if f.is_file()) if "://" not in place else -1
+    return {
+        "version": network.version,
+        "points": len(accuracy.ids),
+        "points_pending": int(sum(c["points"] for c in cells)) - len(accuracy.ids),
+        "rays": int(sum(c["rays"] for c in cells)),
+        "rays_rejected": int(sum(c["rays"] - c["accepted"] for c in cells)),
+        "images": snapshot.image_count(),
+        "images_flagged": ", ".join(released["image_id"][released["released"] == 1].tolist()),
+        "blocks": int((status["status"] == "fused").sum()),
+        "tiles": len(snapshot.tile_numbers()),
+        "cells": len(cells),
+        "ce90_median": float(np.median(accuracy.ce90)) if len(accuracy.ids) else float("nan"),
+        "le90_median": float(np.median(accuracy.le90)) if len(accuracy.ids) else float("nan"),
+        "tile_km": network.cover.core / 1000.0,
+        "overlap_km": network.cover.overlap / 1000.0,
+        "frame": snapshot.metadata.frame,
+        "bytes": size,
+    }

@@ -1,0 +1,109 @@
+"""Tables of ground points from outside: control, check points, simulated truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from submin.errors import CatalogueError, InputError
+from submin.formats.columns import Column, number, number_values, read_table, refuse, text, text_values
+from submin.formats.tables import covariance_of_rows
+from submin.geodesy import local_axes, rotate_covariance
+from submin.storage.catalogue_schema import COVARIANCE_COLUMNS, SIGMA_COLUMNS, PointTable, first_repeated
+
+Array = NDArray[np.float64]
+
+POINT_COLUMNS = (
+    text("point_id"), number("longitude"), number("latitude"), number("height"), text("area", False, blank=True),
+    *(number(name, False) for name in (*COVARIANCE_COLUMNS, *SIGMA_COLUMNS)),
+    Column("covariance_row", pa.list_(pa.float64()), False),
+)  # fmt: skip
+
+Covariances = Literal["definite", "any", "none"]
+"""What is asked of the points' covariances; see `read_point_table`."""
+
+
+def read_point_table(path: str | Path, covariance: Covariances = "any") -> PointTable:
+    """Ground points of a Parquet or CSV file: the layout of ``control``, ``check`` and ``truth`` in a catalogue.
+
+    Parameters
+    ----------
+    path : file with ``point_id``, ``longitude``, ``latitude``, ``height``, perhaps ``area``, and covariances as ``cov_ee`` ... ``cov_uu``
+        (m2) or as ``sigma_e``, ``sigma_n``, ``sigma_u`` (m), or as ``covariance_row`` (joint, geocentric axes, as query output has it)
+    covariance : ``definite`` for points that control (no direction is known without error), ``any``, or ``none`` when it may be
+        absent: zeros
+
+    Raises
+    ------
+    CatalogueError
+        When a column is missing, an id comes twice, coordinates are out of range, or a covariance is none.
+    """
+    file = Path(path)
+    table = read_table(file, POINT_COLUMNS)
+    point_ids, n = text_values(table, "point_id"), table.num_rows
+    repeated = first_repeated(np.unique(point_ids, return_inverse=True)[1], np.zeros(n, dtype=np.int8))
+    if repeated is not None:
+        earlier, later = repeated
+        raise CatalogueError(
+            f"{file}: row {later + 1}: point_id {str(point_ids[later])!r} is that of row {earlier + 1} too; expected it once"
+        )
+    geodetic = np.stack([number_values(table, name) for name in ("longitude", "latitude", "height")], axis=1)
+    limits = (("longitude", 360.0, "degrees from -360 to 360"), ("latitude", 90.0, "degrees from -90 to 90"), ("height", 1e9, "metres"))
+    for k, (name, limit, expected) in enumerate(limits):
+        refuse(pa.array(~(np.abs(geodetic[:, k]) <= limit)), table[name], name, file, 1, expected)
+    enu, joint = _covariances(table, file, geodetic, covariance)
+    return PointTable(point_ids, geodetic, enu, text_values(table, "area"), joint)
+
+
+def _covariances(table: pa.Table, path: Path, geodetic: Array, kind: Covariances) -> tuple[Array, Array | None]:
+    """Covariance of each point (n, 3, 3) in local axes, and the joint one where the table has it."""
+    names, n = table.schema.names, table.num_rows
+    joint = _joint_covariance(table, path) if "covariance_row" in names else None
+    enu = np.zeros((n, 3, 3))
+    if any(name in names for name in COVARIANCE_COLUMNS):
+        for name, row, column in zip(COVARIANCE_COLUMNS, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), strict=True):
+            enu[:, row, column] = enu[:, column, row] = _finite(table, name, path)
+    elif any(name in names for name in SIGMA_COLUMNS):
+        for k, name in enumerate(SIGMA_COLUMNS):
+            sigma = _finite(table, name, path)
+            refuse(pa.array(sigma < 0.0), table[name], name, path, 1, "metres, not negative")
+            enu[:, k, k] = sigma**2
+    elif joint is not None:
+        own = joint.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+        enu = rotate_covariance(own, local_axes(geodetic))
+    elif kind != "none":
+        raise CatalogueError(
+            f"{path}: columns of the covariance are missing; expected {', '.join(COVARIANCE_COLUMNS)}, or {', '.join(SIGMA_COLUMNS)}"
+        )
+    else:
+        return enu, None
+    values = np.linalg.eigvalsh(enu)
+    floor = 1e-12 * np.abs(values[:, -1])  # round-off of the eigenvalues themselves
+    bad = values[:, 0] <= 0.0 if kind == "definite" else values[:, 0] < -floor
+    refuse(
+        pa.array(bad), pa.array(enu.reshape(n, 9).tolist()), "covariance", path, 1,
+        "a positive definite matrix (m2)" if kind == "definite" else "a matrix without negative eigenvalues (m2)",
+    )  # fmt: skip
+    return enu, joint
+
+
+def _finite(table: pa.Table, name: str, path: Path) -> Array:
+    if name not in table.schema.names:
+        raise CatalogueError(f"{path}: column {name!r} is missing; expected {', '.join(COVARIANCE_COLUMNS)}, or {', '.join(SIGMA_COLUMNS)}")
+    values = number_values(table, name)
+    refuse(pa.array(~np.isfinite(values)), table[name], name, path, 1, "a finite number")
+    return values
+
+
+def _joint_covariance(table: pa.Table, path: Path) -> Array:
+    try:
+        return covariance_of_rows(table["covariance_row"].chunks, table.num_rows, str(path))
+    except InputError as error:
+        raise CatalogueError(str(error)) from None
+
+
+__all__ = ["POINT_COLUMNS", "Covariances", "PointTable", "read_point_table"]
