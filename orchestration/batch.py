@@ -29,7 +29,7 @@ from orchestration.tasks import (
 )
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import SAME_POINT_METRES, ArrivingRays, Registration, register
-from submin.storage.arrays import append_table, group_of, hash_ids, set_rows
+from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
 from submin.storage.catalogue_schema import Block
 from submin.storage.network_store import Snapshot, commit, writable_session
 
@@ -52,7 +52,7 @@ class BatchResult:
     ----------
     version : number of the committed version
     fused : ids of the fused blocks; rejected : the others
-    flagged : images whose camera was found bad in this batch
+    flagged : images whose camera the judged tiles find bad
     tiles : that were judged; unsettled : tiles whose judgement did not come to rest (their rays are used as last judged)
     """
 
@@ -77,22 +77,22 @@ def fuse_batch(place: str, blocks: Sequence[Block], rejected: Sequence[Rejected]
     refused = list(rejected)
     blocks, accepted = _stage_one(blocks, base, executor, reporter, refused)
     first_image = base.image_count()
-    blocks, images, rays, registration = _register(blocks, accepted, base, first_image, refused)
+    blocks, images, registration = _register(blocks, accepted, base, first_image, refused)
 
     reports: list[TileReport] = []
-    flagged: dict[int, FlaggedImage] = {}
+    flags = base.flags()
     if blocks:
-        reports, flagged, writes = _fuse(session, base, registration, images, executor, reporter)
+        reports, flags, writes = _fuse(session, base, registration, images, executor, reporter)
         session.merge(*writes)
     elif _already_entered(base, refused):
         return BatchResult(base.number, (), tuple(refused), (), (), ())
     cells = {number: report for tile in reports for number, report in tile.cells.items()}
     version = base.number + 1
-    _enter(session, base, version, blocks, refused, images, registration, rays, flagged, cells)
+    _enter(session, base, version, blocks, refused, images, registration, flags, cells)
     fused = tuple(block.block_id for block in blocks)
     commit(session, version, f"{len(fused)} blocks fused, {len(refused)} rejected")
     return BatchResult(
-        version, fused, tuple(refused), tuple(flagged.values()),
+        version, fused, tuple(refused), tuple(image for report in reports for image in report.flagged),
         tuple(r.tile for r in reports), tuple(r.tile for r in reports if not r.converged),
     )  # fmt: skip
 
@@ -124,7 +124,7 @@ def _stage_one(
 
 def _register(
     blocks: list[Block], accepted: dict[str, NDArray[np.bool_]], base: Snapshot, first_image: int, refused: list[Rejected]
-) -> tuple[list[Block], list[NetworkImage], ArrivingRays, Registration]:
+) -> tuple[list[Block], list[NetworkImage], Registration]:
     """Register the rays of the batch; a block that measures a known point elsewhere, or nothing inside the area, is rejected."""
     while True:
         images = [image for block in blocks for image in _network_images(block)]
@@ -139,7 +139,7 @@ def _register(
         )  # fmt: skip
         bad = _misplaced(blocks, rays, registration)
         if not bad:
-            return blocks, images, rays, registration
+            return blocks, images, registration
         refused.extend(Rejected(blocks[k].block_id, reason) for k, reason in bad.items())
         blocks = [block for k, block in enumerate(blocks) if k not in bad]
 
@@ -165,8 +165,8 @@ def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Regist
 
 def _fuse(
     session: icechunk.Session, base: Snapshot, registration: Registration, images: list[NetworkImage], executor: Executor, reporter: Reporter
-) -> tuple[list[TileReport], dict[int, FlaggedImage], list[icechunk.ForkSession]]:
-    """Update and factor every tile that the batch touches."""
+) -> tuple[list[TileReport], set[tuple[int, int]], list[icechunk.ForkSession]]:
+    """Update and factor every tile that the batch touches; the reports of the tiles, all flags of images, and the writes."""
     cover = base.cover
     touched = sorted({*registration.arrivals, *registration.departures})
     tiles = sorted({tile for cell in touched for tile in cover.holders(cell)})
@@ -185,16 +185,21 @@ def _fuse(
     quiet = reporter.stage("summing tiles", 0)
     reports: list[TileReport] = executor.results(executor.submit_all(report_of, [(u,) for u in updates], "report-of", quiet))
 
-    flagged = {image.row: image for report in reports for image in report.flagged}
+    before = base.flags()
+    judged = {report.tile for report in reports if report.converged}
+    flags = {(tile, row) for tile, row in before if tile not in judged}
+    flags |= {(report.tile, image.row) for report in reports for image in report.flagged}
+    released = sorted({row for _, row in flags})
+    reconsidered = set(released) ^ {row for _, row in before}
     changed = {cell for report in reports for cell in report.changed}
-    again = {tile for cell in changed for tile in cover.holders(cell)} | _tiles_that_see(base, set(flagged))
+    again = {tile for cell in changed for tile in cover.holders(cell)} | _tiles_that_see(base, reconsidered)
     to_factor = []
     for tile in sorted(again):
         sources = sorted({cover.owner(c) for c in cover.cells_held(tile)} & set(by_tile))
-        to_factor.append((session.fork(), tile, [by_tile[t] for t in sources], shared, sorted(flagged)))
+        to_factor.append((session.fork(), tile, [by_tile[t] for t in sources], shared, released))
     handles = executor.submit_all(factor_tile, to_factor, "factor-tile", reporter.stage("factoring tiles", len(to_factor)))
     writes = [report.writes for report in reports] + [done.writes for done in executor.results(handles)]
-    return reports, flagged, writes
+    return reports, flags, writes
 
 
 def _tiles_that_see(base: Snapshot, rows: set[int]) -> set[int]:
@@ -205,7 +210,7 @@ def _tiles_that_see(base: Snapshot, rows: set[int]) -> set[int]:
 
 def _enter(
     session: icechunk.Session, base: Snapshot, version: int, blocks: Sequence[Block], refused: Sequence[Rejected], images: Sequence[NetworkImage],
-    registration: Registration, rays: ArrivingRays, flagged: dict[int, FlaggedImage], cells: dict[int, CellReport],
+    registration: Registration, flags: set[tuple[int, int]], cells: dict[int, CellReport],
 ) -> None:  # fmt: skip
     """Write what the coordinator keeps: images, ledger, directory, version."""
     root = zarr.open_group(session.store, mode="r+")
@@ -220,7 +225,11 @@ def _enter(
         "footprint": _texts(r.footprint.hex() for r in records), "licence": _texts(r.licence for r in records),
         "a_priori": _texts(i.a_priori for i in images), "released": np.zeros(len(images), dtype=np.uint8),
     })  # fmt: skip
-    set_rows(group_of(root, "images"), "released", np.array(sorted(flagged), dtype=np.int64), np.ones(len(flagged), dtype=np.uint8))
+    released, before = {row for _, row in flags}, {row for _, row in base.flags()}
+    reconsidered = np.array(sorted(released ^ before), dtype=np.int64)
+    set_rows(group_of(root, "images"), "released", reconsidered, np.isin(reconsidered, sorted(released)).astype(np.uint8))
+    tile_and_image = np.array(sorted(flags), dtype=np.int64).reshape(-1, 2)
+    replace_table(group_of(root, "flags"), {"tile": tile_and_image[:, 0], "image": tile_and_image[:, 1]})
 
     used = np.zeros(first + len(images), dtype=np.int64)
     rejected = np.zeros_like(used)

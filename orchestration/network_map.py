@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import shapely
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
@@ -30,16 +31,25 @@ Box = tuple[float, float, float, float]
 
 DOTS_PER_INCH = 160
 METRES_BELOW = 5000.0
-"""Maps of a smaller extent are in metres, others in kilometres."""
+"""Maps of a smaller extent are in metres, others in kilometres; so are lengths in the heading."""
 ROBUST = (2.0, 98.0)
 """Percentiles at which the colours end."""
-INK = 0.10
+INK = 0.16
 """Part of a map that its points would cover if they lay apart."""
-MOST_NAMED = 6
-"""Flagged images that are named one by one."""
+NARROWEST = np.array([0.4, 0.25])
+"""Least width over height, and height over width, of a map."""
+WIDE = 1.8
+"""A map of a larger width over height has the other panels below it."""
+RIMMED = 4.0
+"""Points larger than this (square points of print) get a thin rim, which keeps neighbours apart."""
+NAMED_INCHES = 0.7
+"""Cores of at least this width on the map carry the name of their tile."""
+LETTERS_AN_INCH = 11.0
+LONGEST_ID = 40
 
 PAPER, GROUND, DARK, SOFT, RULE = "#ffffff", "#f7f8fa", "#1f2933", "#616e7c", "#cbd2d9"
-CORE, TILE, IMAGE, FLAGGED = "#3e4c59", "#7b8794", "#4a7fb5", "#d7263d"
+CORE, TILE, IMAGE, COVERED, FLAGGED = "#3e4c59", "#7b8794", "#4a7fb5", "#a9c5e3", "#d7263d"
+DASHES = (0, (5, 4))
 HORIZONTAL, VERTICAL = "#3a0ca3", "#e07a1f"
 
 # plasma without its light end, which is lost on paper; a part of a perceptually uniform map is one too
@@ -80,7 +90,7 @@ class _Layout:
 
 @dataclass(frozen=True)
 class _Images:
-    """Images: their number, ids of the flagged ones, and outlines (k, 2) in plane metres of all and of the flagged that have a footprint."""
+    """Number of images, ids of the flagged ones, and the outlines (k, 2) of footprints in plane metres: of all, and of the flagged."""
 
     count: int
     flagged_ids: list[str]
@@ -127,19 +137,23 @@ def network_figure(network: Network, title: str | None = None) -> Figure:
 
     main, small = _axes(figure, layout, layout.main), _axes(figure, layout, layout.small)
     for axes, values, bar, label, box in (
-        (main, points.ce90, layout.main_bar, "CE90 of a point (m)", layout.main),
+        (main, points.ce90, layout.main_bar, "CE90 (m)", layout.main),
         (small, points.le90, layout.small_bar, "LE90 (m)", layout.small),
     ):
-        _draw_ground(axes, cover, view, images, detail=axes is main)
+        _draw_cores(axes, cover, view, box[2])
         if len(points):
             scatter = _draw_points(axes, place, values, box)
             _draw_bar(figure, _axes(figure, layout, bar), scatter, values, label)
+    _draw_footprints(main, view, images)
+    _draw_tiles(main, cover, view, layout.main[2])
     _label_axes(main, cover, view)
     if not len(points):
         main.text(0.5, 0.5, "no determined points yet", transform=main.transAxes, ha="center", va="center", color=SOFT, fontsize=13)
-    _strip(small, "Vertical accuracy")
+    main.set_title("Horizontal accuracy of each point, from the tile whose core holds it", loc="left", fontsize=9, color=DARK)
+    small.set_title("Vertical accuracy", loc="left", fontsize=9, color=DARK)
+    small.set(xticks=[], yticks=[])
     _draw_histogram(_axes(figure, layout, layout.histogram), points)
-    _draw_legend(main, images, int((~view.holds(place)).sum()))
+    _draw_legend(figure, layout, cover, images, int((~view.holds(place)).sum()))
     _draw_heading(figure, layout, network, points, images, title)
     return figure
 
@@ -147,17 +161,20 @@ def network_figure(network: Network, title: str | None = None) -> Figure:
 def _images(network: Network) -> _Images:
     columns = network.snapshot.image_columns(["image_id", "footprint", "released"])
     flagged = columns["released"] == 1
-    given = columns["footprint"] != ""
-    outlines = [_outline(network.cover, polygon) for polygon in shapely.from_wkb(columns["footprint"][given])]
-    chosen = [outline for outline, bad in zip(outlines, flagged[given], strict=True) if bad]
-    return _Images(len(flagged), columns["image_id"][flagged].tolist(), outlines, chosen)
+    given = np.flatnonzero(columns["footprint"] != "")
+    parts, image = shapely.get_parts(shapely.from_wkb(columns["footprint"][given], on_invalid="ignore"), return_index=True)
+    corners, part = shapely.get_coordinates(shapely.get_exterior_ring(parts), return_index=True)
+    # sides are straight in the plane, so a footprint may cross the antimeridian
+    plane = np.column_stack(network.cover.plane(corners[:, 0], corners[:, 1]))
+    outlines = {int(k): outline for k, outline in _groups(part, plane) if np.isfinite(outline).all()}
+    bad = [outline for k, outline in outlines.items() if flagged[given[image[k]]]]
+    return _Images(len(flagged), columns["image_id"][flagged].tolist(), list(outlines.values()), bad)
 
 
-def _outline(cover: Cover, polygon: shapely.Polygon) -> Array:
-    """Corners (k, 2) of a footprint in plane metres; its sides are straight there, so it may cross the antimeridian."""
-    corners = shapely.get_coordinates(polygon)
-    plane = np.column_stack(cover.plane(corners[:, 0], corners[:, 1]))
-    return plane[np.isfinite(plane).all(axis=1)]
+def _groups(keys: NDArray[np.integer], values: Array) -> Iterator[tuple[int, Array]]:
+    """Values of each key, where equal keys stand together."""
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    return zip(keys[first].tolist(), np.split(values, first[1:]), strict=False) if len(first) else iter(())
 
 
 def _view(cover: Cover, plane: Array) -> _View:
@@ -169,31 +186,47 @@ def _view(cover: Cover, plane: Array) -> _View:
         low = np.maximum(np.minimum(low, plane.min(axis=0)), low - cover.core)
         high = np.minimum(np.maximum(high, plane.max(axis=0)), high + cover.core)
     middle, size = 0.5 * (low + high), 1.04 * (high - low)
-    # a page is no ribbon
-    size = np.maximum(size, size[::-1] * (0.4, 0.4))
-    unit, metres = ("m", 1.0) if size.max() < METRES_BELOW else ("km", 1000.0)
+    size = np.maximum(size, size[::-1] * NARROWEST)
+    unit, metres = _unit(float(size.max()))
     west, south = (middle - 0.5 * size) / metres
     east, north = (middle + 0.5 * size) / metres
     return _View((float(west), float(south), float(east), float(north)), unit, metres)
 
 
+def _unit(length: float) -> tuple[str, float]:
+    """The unit in which to write lengths up to this one, metres: its name and its metres."""
+    return ("m", 1.0) if length < METRES_BELOW else ("km", 1000.0)
+
+
 def _layout(aspect: float) -> _Layout:
-    width = min(8.0, 7.2 * aspect)
-    height = width / aspect
-    tall = max(height, 5.6)
-    left, below, above, bar, column = 0.95, 1.35, 0.95, 0.16, 2.9
-    small_width = min(column, 3.1 * aspect)
-    small_height = small_width / aspect
-    right = left + width + 1.55
-    top = below + tall
+    """The small map and the histogram beside the large map, or below it when it is wide."""
+    left, below, above, bar, label, gap = 0.95, 1.35, 1.2, 0.16, 0.95, 0.8
+    if aspect <= WIDE:
+        width = min(8.0, 7.2 * aspect)
+        height = width / aspect
+        tall, column = max(height, 5.6), 2.9
+        small_width = min(column, 3.1 * aspect)
+        small_height = small_width / aspect
+        x, top = left + width + label + 0.6, below + tall
+        small = (x, top - small_height, small_width, small_height)
+        histogram = (x, below, column, tall - small_height - gap)
+        page_width = x + column + label
+    else:
+        width, row = 11.0, 2.6
+        height = width / aspect
+        small_width = min(0.45 * width, row * aspect)
+        small_height = small_width / aspect
+        x, top = left + small_width + label + 0.75, below + row + gap + 0.2 + height
+        small = (left, below + row - small_height, small_width, small_height)
+        histogram = (x, below, left + width - x, row)
+        page_width = left + width + label
+    main = (left, top - height, width, height)
     return _Layout(
-        page=(right + column + 0.85, top + above),
-        main=(left, top - height, width, height),
-        main_bar=(left + width + 0.18, top - height, bar, height),
-        small=(right, top - small_height, small_width, small_height),
-        small_bar=(right + small_width + 0.14, top - small_height, 0.7 * bar, small_height),
-        histogram=(right, below, column, tall - small_height - 0.75),
-    )
+        (page_width, top + above),
+        main, (left + width + 0.18, main[1], bar, height),
+        small, (small[0] + small_width + 0.14, small[1], 0.7 * bar, small_height),
+        histogram,
+    )  # fmt: skip
 
 
 def _axes(figure: Figure, layout: _Layout, box: Box) -> Axes:
@@ -205,76 +238,82 @@ def _axes(figure: Figure, layout: _Layout, box: Box) -> Axes:
     return axes
 
 
-def _draw_ground(axes: Axes, cover: Cover, view: _View, images: _Images, *, detail: bool) -> None:
-    """Footprints, cores, tiles: what lies beneath the points."""
+def _draw_cores(axes: Axes, cover: Cover, view: _View, width: float) -> None:
+    """Window and borders of cores, as a map so many inches wide has them."""
     west, south, east, north = view.box
     axes.set(xlim=(west, east), ylim=(south, north), facecolor=GROUND, aspect="equal")
-    x = (cover.origin[0] + cover.core * np.arange(cover.columns + 1)) / view.metres
-    y = (cover.origin[1] + cover.core * np.arange(cover.rows + 1)) / view.metres
-    many = max(cover.rows, cover.columns)
-    if detail:
-        _draw_footprints(axes, view, images)
-        half = 0.5 * cover.overlap / view.metres
-        if half > 0.0:
-            sides = np.unique(np.concatenate([x - half, x + half])), np.unique(np.concatenate([y - half, y + half]))
-            lines = LineCollection(
-                _grid(*sides), colors=TILE, linewidths=0.6 if many <= 20 else 0.3, linestyles=[(0, (5, 4))], alpha=0.65, zorder=2
-            )
-            axes.add_collection(lines, autolim=False)
-        _name_tiles(axes, cover, view)
-    axes.add_collection(
-        LineCollection(_grid(x, y), colors=CORE, linewidths=0.9 if detail and many <= 20 else 0.4, zorder=2.1), autolim=False
+    core = _inches(cover.core, view, width)
+    lines = LineCollection(_grid(*_borders(cover, view)), colors=CORE, linewidths=float(np.clip(core, 0.15, 0.9)), zorder=2.1)
+    axes.add_collection(lines, autolim=False)
+
+
+def _draw_tiles(axes: Axes, cover: Cover, view: _View, width: float) -> None:
+    """Outlines of tiles, and where there is room for them their names."""
+    half, core = 0.5 * cover.overlap / view.metres, _inches(cover.core, view, width)
+    if half > 0.0:
+        x, y = _borders(cover, view)
+        # a tile reaches over the borders of its core; beyond the rim there is no neighbour that reaches back
+        sides = _grid(np.concatenate([x[:-1] - half, x[1:] + half]), np.concatenate([y[:-1] - half, y[1:] + half]))
+        lines = LineCollection(sides, colors=TILE, linewidths=float(np.clip(0.7 * core, 0.15, 0.6)), alpha=0.65, zorder=2)
+        lines.set_linestyle([DASHES])
+        axes.add_collection(lines, autolim=False)
+    if core < NAMED_INCHES:
+        return
+    for tile in cover.tiles():
+        west, north = cover.core_outline(tile)[3] / view.metres
+        axes.annotate(
+            cover.tile_name(tile), (west, north), xytext=(4, -4), textcoords="offset points", ha="left", va="top", fontsize=6.5,
+            color=SOFT, zorder=5, path_effects=[withStroke(linewidth=2.0, foreground=GROUND)],
+        )  # fmt: skip
+
+
+def _borders(cover: Cover, view: _View) -> tuple[Array, Array]:
+    """Eastings and northings of the borders of cores, in units."""
+    return (
+        np.asarray(cover.origin[0] + cover.core * np.arange(cover.columns + 1.0)) / view.metres,
+        np.asarray(cover.origin[1] + cover.core * np.arange(cover.rows + 1.0)) / view.metres,
     )
+
+
+def _inches(length: float, view: _View, width: float) -> float:
+    """Length, in metres, as it is on a map so many inches wide."""
+    return length / view.metres / (view.box[2] - view.box[0]) * width
 
 
 def _grid(x: Array, y: Array) -> list[Array]:
     """Lines along every x over the whole of y, and along every y over the whole of x."""
-    return [np.array([[v, y[0]], [v, y[-1]]]) for v in x] + [np.array([[x[0], v], [x[-1], v]]) for v in y]
+    return [np.array([[v, y.min()], [v, y.max()]]) for v in x] + [np.array([[x.min(), v], [x.max(), v]]) for v in y]
 
 
 def _draw_footprints(axes: Axes, view: _View, images: _Images) -> None:
-    outlines = [outline / view.metres for outline in images.outlines]
+    """All of them lightly, so that coverage shows; the flagged ones in red."""
+    outlines, flagged = ([outline / view.metres for outline in some] for some in (images.outlines, images.flagged_outlines))
     if outlines:
-        west, south, east, north = view.box
-        covered = sum(float(shapely.area(shapely.polygons(o))) for o in outlines if len(o) > 3)
-        depth = max(covered / ((east - west) * (north - south)), 1.0)
-        # places of average coverage become a quarter blue, however many images cover them
-        face = 1.0 - 0.75 ** (1.0 / depth)
+        corners = np.concatenate(outlines)
+        low = np.maximum(corners.min(axis=0), view.box[:2])
+        high = np.minimum(corners.max(axis=0), view.box[2:])
+        covered = float(shapely.area([shapely.Polygon(outline) for outline in outlines]).sum())
+        depth = max(covered / max(float(np.prod(high - low)), 1e-9), 1.0)
+        # places of average coverage become half as blue as can be; fainter films than 0.025 are lost in eight bits
+        face = max(1.0 - 0.5 ** (1.0 / depth), 0.025)
         edge = float(np.clip(12.0 / np.sqrt(len(outlines)), 0.08, 0.45))
-        faces = PolyCollection(outlines, facecolors=[(*matplotlib.colors.to_rgb(IMAGE), face)], edgecolors="none", zorder=1)
-        edges = PolyCollection(outlines, facecolors="none", edgecolors=[(*matplotlib.colors.to_rgb(IMAGE), edge)], linewidths=0.5, zorder=1.1)
-        for collection in (faces, edges):
-            collection.set_rasterized(True)
-            axes.add_collection(collection, autolim=False)
-    if images.flagged_outlines:
-        flagged = [outline / view.metres for outline in images.flagged_outlines]
+        axes.add_collection(PolyCollection(outlines, facecolors=[(COVERED, face)], edgecolors="none", zorder=1), autolim=False)
         axes.add_collection(
-            PolyCollection(flagged, facecolors="none", edgecolors=FLAGGED, linewidths=1.6, zorder=4), autolim=False
+            PolyCollection(outlines, facecolors="none", edgecolors=[(IMAGE, edge)], linewidths=0.5, zorder=1.1), autolim=False
         )
-
-
-def _name_tiles(axes: Axes, cover: Cover, view: _View) -> None:
-    """Names in the corners of the cores, where there is room for them."""
-    west, _, east, _ = view.box
-    figure = axes.get_figure()
-    assert figure is not None
-    inches = axes.get_position().width * figure.get_figwidth() * cover.core / view.metres / (east - west)
-    if inches < 0.7:
-        return
-    for tile in cover.tiles():
-        left, _, _, top = cover.core_outline(tile)[[0, 1, 2, 3], [0, 1, 0, 1]] / view.metres
-        axes.annotate(
-            cover.tile_name(tile), (left, top), xytext=(3, -3), textcoords="offset points", ha="left", va="top", fontsize=6.5,
-            color=SOFT, zorder=5, path_effects=[withStroke(linewidth=1.8, foreground=GROUND)], annotation_clip=True,
-        )  # fmt: skip
+    if flagged:
+        halo = [withStroke(linewidth=3.2, foreground=PAPER)]
+        red = PolyCollection(flagged, facecolors="none", edgecolors=FLAGGED, linewidths=1.6, zorder=4, path_effects=halo)
+        axes.add_collection(red, autolim=False)
 
 
 def _draw_points(axes: Axes, place: Array, values: Array, box: Box) -> PathCollection:
-    order = np.argsort(values, kind="stable")  # the worst on top: they are what one looks for
-    size = float(np.clip(INK * box[2] * box[3] * 72.0**2 / len(values), 0.12, 26.0))
+    # shuffled: where points hide each other, no value is favoured
+    order = np.random.default_rng(0).permutation(len(values))
+    size = float(np.clip(INK * box[2] * box[3] * 72.0**2 / len(values), 0.5, 26.0))
     return axes.scatter(
-        place[order, 0], place[order, 1], c=values[order], s=size, cmap=COLOURS, norm=Normalize(*_limits(values)), linewidths=0.0,
-        rasterized=True, zorder=3,
+        place[order, 0], place[order, 1], c=values[order], s=size, cmap=COLOURS, norm=Normalize(*_limits(values)), edgecolors=PAPER,
+        linewidths=0.3 if size > RIMMED else 0.0, rasterized=True, zorder=3,
     )  # fmt: skip
 
 
@@ -291,7 +330,7 @@ def _draw_bar(figure: Figure, axes: Axes, scatter: PathCollection, values: Array
     beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
     extend = beyond[bool(values.min() < low), bool(values.max() > high)]
     bar = figure.colorbar(scatter, cax=axes, extend=extend, extendfrac=0.025)
-    bar.outline.set(linewidth=0.0)  # type: ignore[operator]
+    bar.outline.set(linewidth=0.0)
     bar.locator = MaxNLocator(6)
     bar.update_ticks()
     axes.tick_params(colors=SOFT, labelsize=8, length=2, width=0.6)
@@ -305,11 +344,6 @@ def _label_axes(axes: Axes, cover: Cover, view: _View) -> None:
     axes.set_ylabel(f"north of {abs(latitude):.{digits}f}° {'N' if latitude >= 0 else 'S'} ({view.unit})", color=DARK, fontsize=9)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
-
-
-def _strip(axes: Axes, heading: str) -> None:
-    axes.set(xticks=[], yticks=[])
-    axes.set_title(heading, loc="left", fontsize=9, color=DARK)
 
 
 def _draw_histogram(axes: Axes, points: PointAccuracy) -> None:
@@ -329,10 +363,19 @@ def _draw_histogram(axes: Axes, points: PointAccuracy) -> None:
         axes.stairs(counts, edges, color=colour, linewidth=1.1, label=f"{name}, median {_metres(median)}")
         axes.axvline(median, color=colour, linewidth=1.0, linestyle=(0, (4, 2)))
     axes.set_xlim(edges[0], edges[-1])
-    axes.set_xlabel("m", color=DARK, fontsize=9)
+    axes.set_xlabel("accuracy (m)", color=DARK, fontsize=9)
     axes.set_ylabel("points", color=DARK, fontsize=9)
     axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    axes.legend(frameon=False, fontsize=8, loc="upper right", labelcolor=DARK, handlelength=1.4)
+    axes.legend(
+        fontsize=8,
+        loc="upper right",
+        labelcolor=DARK,
+        handlelength=1.4,
+        facecolor=PAPER,
+        edgecolor="none",
+        framealpha=0.85,
+        borderaxespad=0.0,
+    )
 
 
 def _metres(value: float) -> str:
@@ -341,41 +384,61 @@ def _metres(value: float) -> str:
     return f"{value:,.{min(max(digits, 0), 4)}f} m"
 
 
-def _draw_legend(axes: Axes, images: _Images, outside: int) -> None:
-    handles = [
-        Line2D([], [], color=CORE, linewidth=0.9),
-        Line2D([], [], color=TILE, linewidth=0.8, linestyle=(0, (5, 4))),
-        Patch(facecolor=(*matplotlib.colors.to_rgb(IMAGE), 0.25), edgecolor=IMAGE, linewidth=0.5),
-    ]  # fmt: skip
-    labels = ["core of a tile", "outline of a tile", "footprint of an image"]
-    if images.flagged_ids:
-        named = ", ".join(_shortened(image_id) for image_id in images.flagged_ids[:MOST_NAMED])
-        more = len(images.flagged_ids) - MOST_NAMED
-        handles.append(Patch(facecolor="none", edgecolor=FLAGGED, linewidth=1.6))
-        labels.append(f"bad camera: {named}" + (f" and {more} more" if more > 0 else ""))
+def _draw_legend(figure: Figure, layout: _Layout, cover: Cover, images: _Images, outside: int) -> None:
+    entries: list[tuple[Artist, str]] = [(Line2D([], [], color=CORE, linewidth=0.9), "core of a tile")]
+    if cover.overlap > 0.0:
+        entries.append((Line2D([], [], color=TILE, linewidth=0.8, linestyle=DASHES), "outline of a tile"))
+    if images.outlines:
+        entries.append((Patch(facecolor=(COVERED, 0.5), edgecolor=IMAGE, linewidth=0.5), "footprint of an image"))
     if outside:
-        handles.append(Line2D([], [], linestyle="none"))
-        labels.append(f"{outside} points lie beyond the map")
-    legend = axes.legend(
-        handles, labels, loc="upper left", bbox_to_anchor=(-0.01, -0.09), ncols=3, frameon=False, fontsize=8.5, labelcolor=DARK,
-        handlelength=1.8, columnspacing=1.6, borderaxespad=0.0, handler_map={tuple: HandlerTuple()},
+        entries.append((Line2D([], [], linestyle="none"), f"{_number(outside, 'point')} beyond the map"))
+    _legend_row(figure, layout, entries, 0.62)
+    if images.flagged_ids:
+        label = f"{len(images.flagged_ids):,} of {_number(images.count, 'camera')} found to be bad: "
+        letters = int(LETTERS_AN_INCH * (layout.page[0] - layout.main[0])) - len(label)
+        _legend_row(
+            figure,
+            layout,
+            [(Patch(facecolor="none", edgecolor=FLAGGED, linewidth=1.6), label + _listed(images.flagged_ids, letters))],
+            0.36,
+        )
+
+
+def _legend_row(figure: Figure, layout: _Layout, entries: list[tuple[Artist, str]], up: float) -> None:
+    """A row of the legend, so many inches from the foot of the page."""
+    width, height = layout.page
+    handles, labels = zip(*entries, strict=True)
+    legend = figure.legend(
+        handles, labels, loc="center left", bbox_to_anchor=(layout.main[0] / width, up / height), ncols=len(labels), frameon=False,
+        fontsize=8.5, labelcolor=DARK, handlelength=1.8, columnspacing=1.8, borderaxespad=0.0, borderpad=0.0,
     )  # fmt: skip
     for text in legend.get_texts():
         text.set_parse_math(False)
 
 
-def _shortened(text: str, most: int = 32) -> str:
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+def _listed(ids: Sequence[str], letters: int) -> str:
+    """As many ids as there is room for, at least one, and how many more there are."""
+    used = np.cumsum([min(len(i), LONGEST_ID) + 2 for i in ids])
+    shown = max(int(np.searchsorted(used, letters - 16, side="right")), 1)
+    named = ", ".join(i if len(i) <= LONGEST_ID else f"{i[: LONGEST_ID - 1]}…" for i in ids[:shown])
+    return named + (f" and {len(ids) - shown:,} more" if len(ids) > shown else "")
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def _draw_heading(figure: Figure, layout: _Layout, network: Network, points: PointAccuracy, images: _Images, title: str | None) -> None:
     metadata, cover = network.snapshot.metadata, network.cover
-    unit, metres = ("m", 1.0) if cover.core < METRES_BELOW else ("km", 1000.0)
+    unit, metres = _unit(cover.core)
+    core, overlap = (f"{length / metres:g} {unit}" for length in (cover.core, cover.overlap))
     heading = f"{metadata.name}, version {network.version}" if title is None else title
-    facts = (
-        f"{len(points):,} points   ·   {images.count:,} images   ·   {cover.rows * cover.columns:,} tiles, cores of {cover.core / metres:g} {unit}, "
-        f"overlap {cover.overlap / metres:g} {unit}   ·   {metadata.frame}" + (f", epoch {metadata.epoch}" if metadata.epoch else "")
-    )
+    facts = "   ·   ".join((
+        _number(len(points), "point"),
+        _number(images.count, "image"),
+        f"{_number(cover.rows * cover.columns, 'tile')}, cores of {core}, overlap {overlap}",
+        metadata.frame + (f", epoch {metadata.epoch}" if metadata.epoch else ""),
+    ))  # fmt: skip
     left, top = layout.main[0] / layout.page[0], layout.page[1]
-    figure.text(left, 1.0 - 0.36 / top, heading, fontsize=15, fontweight="bold", color=DARK, va="center", parse_math=False)
-    figure.text(left, 1.0 - 0.64 / top, facts, fontsize=9, color=SOFT, va="center", parse_math=False)
+    figure.text(left, 1.0 - 0.4 / top, heading, fontsize=15, fontweight="bold", color=DARK, va="center", parse_math=False)
+    figure.text(left, 1.0 - 0.68 / top, facts, fontsize=9, color=SOFT, va="center", parse_math=False)

@@ -133,11 +133,12 @@ def run(
         reporter.fused(len(batch))
 
     after = Snapshot.open(place)
+    released = {row for _, row in after.flags()} - {row for _, row in snapshot.flags()}
     cells = [after.cell_attributes(number) for number in after.cell_numbers()]
     used = sum(cell["accepted"] for cell in cells)
     square = sum(cell["square_px"] for cell in cells)
     return RunResult(
-        after.version, tally.fused, tally.skipped, tuple(tally.rejected), tuple(tally.flagged.values()),
+        after.version, tally.fused, tally.skipped, tuple(tally.rejected), tuple(tally.flagged[row] for row in sorted(released)),
         float(np.sqrt(square / (2.0 * used))) if used else 0.0, used, sum(cell["rays"] for cell in cells) - used,
         tuple(after.cover.tile_name(t) for t in sorted(tally.unsettled)), time.monotonic() - started, executor.peak_memory_mb(),
     )  # fmt: skip

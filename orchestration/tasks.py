@@ -161,11 +161,12 @@ def update_tile(
     # a cell that has lost its last point is kept here, so that its empty state is written
     held = [cell for cell in cells.values() if len(cell) or cell.number in departures]
     rows = union_of_images(held)
-    images = image_set(_images(snapshot, rows, new_images), snapshot.metadata.ellipsoid, snapshot.metadata.parameters)
-    rays, _ = bundle(held, rows)
-    # every ray is judged afresh, also one rejected on less evidence: decisions follow from the rays, not from their order of arrival
+    # every ray and image is judged afresh, also one rejected or released on less evidence: decisions follow from the rays, not from their order
+    judged_images = [replace(image, released=False) for image in _images(snapshot, rows, new_images)]
+    images = image_set(judged_images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters)
+    rays, registered = bundle(held, rows)
     rays = rays.with_accepted(np.ones(len(rays), dtype=np.bool_))
-    result = adjust(images, rays, np.concatenate([cell.linearised_at for cell in held]))
+    result = adjust(images, rays, np.concatenate([cell.linearised_at for cell in held]), registered)
 
     sums: dict[int, tuple[NDArray[np.int32], Sums]] = {}
     reports: dict[int, CellReport] = {}
@@ -197,7 +198,10 @@ def report_of(update: TileUpdate) -> TileReport:
 def factor_tile(
     writes: icechunk.ForkSession, tile: int, updates: Sequence[TileUpdate], new_images: Sequence[NetworkImage], released: Sequence[int]
 ) -> TileFactored:
-    """One factorisation: the tile's sub-MIN from the sums of all cells that it holds, new ones from the updates, the others from the store."""
+    """One factorisation: the tile's sub-MIN from the sums of all cells that it holds, new ones from the updates, the others from the store.
+
+    ``released`` are the rows of all images in the network whose prior is released.
+    """
     root = zarr.open_group(writes.store, mode="r+")
     snapshot = Snapshot(root, "network")
     fresh = {number: sums for update in updates for number, sums in update.sums.items()}
@@ -214,7 +218,7 @@ def factor_tile(
             cells.append(number)
     rows = np.unique(np.concatenate([part[0] for part in parts])).astype(np.int32)
     gone = set(released)
-    images = [replace(image, released=image.released or int(row) in gone) for row, image in zip(rows, _images(snapshot, rows, new_images), strict=True)]
+    images = [replace(image, released=int(row) in gone) for row, image in zip(rows, _images(snapshot, rows, new_images), strict=True)]
     sub_min = factor(add_sums(parts, rows, snapshot.metadata.parameters), rows, image_set(images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters))
     write_sub_min(root, snapshot.cover.tile_name(tile), sub_min, cells)
     return TileFactored(tile, len(rows), writes)
@@ -236,7 +240,8 @@ def _report(cell: Cell) -> CellReport:
 def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> tuple[FlaggedImage, ...]:
     names = ("sample bias", "sample drift along samples", "sample drift along lines", "line bias", "line drift along samples", "line drift along lines")
     flagged = []
-    for k in np.flatnonzero(result.released):
+    # a judgement that has not come to rest names nobody
+    for k in np.flatnonzero(result.released & result.converged):
         model = images.priors[k].a_priori
         sigma = np.where(np.isin(np.arange(images.parameters), images.priors[k].bias), model.bias_px, model.drift_px)
         worst = int(np.argmax(np.abs(result.theta[k]) / sigma))

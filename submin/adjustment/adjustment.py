@@ -23,6 +23,9 @@ ROBUST_ITERATIONS = 6
 MAX_ITERATIONS = 40
 FREE_DECISIONS = 12
 """Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
+REACH_METRES = 5000.0
+"""A point is linearised no farther than this from where it was registered. The estimate of a weak point (rays of one viewpoint) may lie
+anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours to choose."""
 CONVERGED_PIXELS = 1e-6
 CONVERGED_METRES = 1e-5
 
@@ -55,8 +58,10 @@ class Adjustment:
     iterations: int
 
 
-def adjust(images: ImageSet, rays: Rays, start: Array) -> Adjustment:
+def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None = None) -> Adjustment:
     """Adjust m images and n ground points by their rays, from ground positions ``start`` (n, 3) and unadjusted cameras.
+
+    ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within `REACH_METRES` of it.
 
     Raises
     ------
@@ -64,12 +69,12 @@ def adjust(images: ImageSet, rays: Rays, start: Array) -> Adjustment:
         When the rays' information is not finite or not positive definite.
     """
     theta = np.zeros((len(images), images.parameters))
-    ground = start.copy()
+    ground, anchor = start.copy(), start if registered is None else registered
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
     for _ in range(ROBUST_ITERATIONS):
-        linear, estimate, moved = _step(images, rays, theta, ground, weight)
-        theta, ground = estimate.theta, ground + moved
+        linear, estimate, ground = _step(images, rays, theta, ground, anchor, weight)
+        theta = estimate.theta
         weight = robust_weights(linear, candidates, theta)
 
     weight = (weight > 0.05).astype(np.float64)
@@ -79,10 +84,10 @@ def adjust(images: ImageSet, rays: Rays, start: Array) -> Adjustment:
     converged, iteration = False, 0
     while not converged and iteration < MAX_ITERATIONS:
         iteration += 1
-        linear, estimate, moved = _step(images, rays, theta, ground, weight)
+        linear, estimate, reached = _step(images, rays, theta, ground, anchor, weight)
         step_px = np.abs(estimate.theta - theta).max(initial=0.0)
-        step_m = np.abs(moved).max(initial=0.0)
-        theta, ground = estimate.theta, ground + moved
+        step_m = np.abs(reached - ground).max(initial=0.0)
+        theta, ground = estimate.theta, reached
         judged, statistic = reject_blunders(
             linear, candidates if iteration <= FREE_DECISIONS else weight, theta, estimate.covariance
         )  # fmt: skip
@@ -102,10 +107,13 @@ def adjust(images: ImageSet, rays: Rays, start: Array) -> Adjustment:
     )  # fmt: skip
 
 
-def _step(images: ImageSet, rays: Rays, theta: Array, ground: Array, weight: Array) -> tuple[LinearRays, ImageEstimate, Array]:
-    """One Gauss-Newton step: the linearised rays, the images' new estimate, and by how much the ground moves (n, 3)."""
+def _step(
+    images: ImageSet, rays: Rays, theta: Array, ground: Array, anchor: Array, weight: Array
+) -> tuple[LinearRays, ImageEstimate, Array]:
+    """One Gauss-Newton step: the linearised rays, the images' new estimate, and the points' new positions (n, 3), within reach of their anchors."""
     linear = linearise(images, rays, theta, ground, ground)
     estimate = estimate_images(eliminate(linear, weight, len(images)), images.prior, images.parameters)
-    moved = ground_corrections(point_factors(linear, weight), linear, estimate.theta)
-    return linear, estimate, moved
-
+    offset = ground + ground_corrections(point_factors(linear, weight), linear, estimate.theta) - anchor
+    distance = np.linalg.norm(offset, axis=1)
+    offset *= np.minimum(1.0, REACH_METRES / np.maximum(distance, REACH_METRES))[:, None]
+    return linear, estimate, anchor + offset

@@ -28,6 +28,9 @@ POLICIES: dict[str, Policy] = {
 }
 """Merge policies. A new one is one file, one line here and one row in the table of `tests/property/test_policies.py`."""
 
+DETERMINED_METRES = 1000.0
+"""A point whose own part is worse (rays of one viewpoint) keeps what its rays say about images, but is not reported as a control point."""
+
 SEARCH_MARGIN_METRES = 2000.0
 """Points are looked for in cells this far around the queried area: a point's estimate may lie outside the cell of its registration."""
 
@@ -218,7 +221,8 @@ def ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection,
     cell = selection.cell
     images = source.image_set(cell.images)
     linear, point_factors = factors(cell, images, selection.rows)
-    good = point_factors.rank == 3
+    own = np.trace(point_factors.own, axis1=1, axis2=2)
+    good = (point_factors.rank == 3) & (np.where(point_factors.rank == 3, own, np.inf) < DETERMINED_METRES**2)
     if not good.all():
         return ground_part(source, Selection(cell, selection.rows[good]))
     rows = cell.images[linear.image]

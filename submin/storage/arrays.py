@@ -159,6 +159,15 @@ def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: in
     return columns
 
 
+def replace_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
+    """Replace all rows of a (small) table without text columns."""
+    for column, values in columns.items():
+        array = array_of(group, column)
+        array.resize((len(values),))
+        if len(values):
+            array[:] = values
+
+
 def set_rows(group: zarr.Group, column: str, rows: NDArray[np.int64], values: AnyArray) -> None:
     """Change some rows of a column that is not text."""
     if len(rows):

@@ -158,7 +158,7 @@ class Network:
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         """Images of these rows."""
-        return image_set(self._snapshot.images(rows), self._snapshot.metadata.ellipsoid, snapshot.metadata.parameters)
+        return image_set(self._snapshot.images(rows), self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
 
     def _control_set(self, found: Answer) -> ControlSet:
         metadata, cover = self._snapshot.metadata, self.cover

@@ -20,6 +20,7 @@ from submin.network.sub_min import SubMin
 from submin.storage.arrays import attributes_of, create_table, group_of, hash_ids, read_record, read_table, table_length
 from submin.storage.schema import (
     DIRECTORY_COLUMNS,
+    FLAG_COLUMNS,
     IMAGE_COLUMNS,
     LEDGER_COLUMNS,
     NetworkMetadata,
@@ -83,6 +84,7 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
         create_table(root, "images", IMAGE_COLUMNS)
         create_table(root, "ledger", LEDGER_COLUMNS)
         create_table(root, "directory", DIRECTORY_COLUMNS)
+        create_table(root, "flags", FLAG_COLUMNS)
         session.commit("created", metadata={"version": 0})
     except (icechunk.IcechunkError, OSError) as error:
         raise StoreError(f"{place}: cannot be written ({str(error).strip().splitlines()[0]})") from error
@@ -186,6 +188,11 @@ class Snapshot:
     def ledger(self, wanted: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
         """Columns of the ledger of blocks; a block's last row counts."""
         return read_table(group_of(self.root, "ledger"), wanted)
+
+    def flags(self) -> set[tuple[int, int]]:
+        """Pairs of tile and image row: the tile finds the image's camera bad."""
+        table = read_table(group_of(self.root, "flags"))
+        return set(zip(table["tile"].tolist(), table["image"].tolist(), strict=True))
 
     def candidate_cells(self, point_ids: NDArray[np.str_]) -> NDArray[np.int64]:
         """Cell (n,) in which each point would be, by the directory; -1 for points that are not in the network."""

@@ -32,6 +32,8 @@ LEDGER_COLUMNS = {
     "block_id": "text", "content": "text", "status": "text", "reason": "text", "version": "int64",
     "images": "int64", "rays": "int64", "rays_rejected": "int64",
 }  # fmt: skip
+FLAG_COLUMNS = {"tile": "int64", "image": "int64"}
+"""Which tile finds the camera of which image bad; the prior of an image is released while any tile says so."""
 DIRECTORY_COLUMNS = {"hash": "uint64", "cell": "int64"}
 
 

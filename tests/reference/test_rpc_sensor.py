@@ -86,7 +86,7 @@ def test_sample_and_line_are_those_of_gdal(data: Path, name: str) -> None:
 def test_across_the_antimeridian_as_anywhere_else(longitude: float) -> None:
     camera = simple_camera(LONG_OFF=longitude)
     shift = places(simple_camera())
-    geodetic = shift + [longitude, 0.0, 0.0]
+    geodetic = shift + np.array([longitude, 0.0, 0.0])
     geodetic[:, 0] -= 360.0 * np.round(geodetic[:, 0] / 360.0)
     assert (geodetic[:, 0] > 0.0).any() and (geodetic[:, 0] < 0.0).any()
     image = project(packed(camera), geodetic_to_geocentric(geodetic)).image
@@ -240,10 +240,10 @@ def test_bad_origin_is_named(origin: Any) -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(0.0, 10.0), (10.0, -1.0), (np.nan, 10.0), (10.0, np.inf)])
 def test_bad_image_size_is_named(width: float, height: float) -> None:
-    with pytest.raises(InputError, match="image size is .* expected positive numbers of pixels"):
+    with pytest.raises(InputError, match=r"image size is .* expected positive numbers of pixels"):
         RPC_SENSOR.pack(simple_camera(), width, height)
 
 
 def test_unknown_sensor_is_named() -> None:
-    with pytest.raises(InputError, match="sensor is 'sar'; expected one of .*rpc"):
+    with pytest.raises(InputError, match=r"sensor is 'sar'; expected one of .*rpc"):
         sensor_named("sar")

@@ -1,0 +1,172 @@
+"""Batches: order, grouping and where they run leave the same network; every block, image and ray exactly once."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import submin
+from networks import SMALL, accepted_rays, area_of, fuse
+from orchestration.executors import executor_for
+from submin.simulation.region import SimulatedRegion, simulate_region
+from submin.storage.catalogue import Catalogue
+from submin.storage.catalogue_schema import Block
+from submin.storage.catalogue_writer import CatalogueWriter
+from submin.storage.network_store import Snapshot, versions
+from submin.storage.simulated import write_region
+
+
+@pytest.fixture(scope="module")
+def region() -> SimulatedRegion:
+    return simulate_region(SMALL)
+
+
+@pytest.fixture(scope="module")
+def catalogue(region: SimulatedRegion, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("region") / "catalogue"
+    write_region(region, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def base(region: SimulatedRegion, catalogue: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    network = tmp_path_factory.mktemp("base") / "network"
+    fuse(catalogue, network, area_of(region))
+    return network
+
+
+def rewrite(catalogue: Path, out: Path, blocks: list[Block]) -> Path:
+    """A catalogue of the same metadata with these blocks."""
+    source = Catalogue.open(catalogue)
+    with CatalogueWriter(out, source.metadata) as writer:
+        writer.write_images(image for block in blocks for image in block.images)
+        for block in blocks:
+            writer.write_block(block)
+        writer.write_priors(source.default_prior, source.priors)
+    return out
+
+
+def by_image(block: Block) -> list[Block]:
+    """One block for every image of a block."""
+    parts = []
+    for k, image in enumerate(block.images):
+        rows = block.image == k
+        parts.append(
+            Block(
+                image.image_id, (dataclasses.replace(image, block_id=image.image_id),), block.a_priori, block.point_ids[rows],
+                np.zeros(rows.sum(), dtype=np.int32), block.sample[rows], block.line[rows], block.sigma_sample[rows], block.sigma_line[rows],
+            )  # fmt: skip
+        )
+    return parts
+
+
+SECOND_ORDER = 0.01 * 2.1
+"""Metres: 0.01 pixel. Batches differ in where cells are linearised; on one fixed linearisation the answers are equal (tests/real)."""
+
+
+def same_network(one: Path, other: Path, metres: float, relative: float) -> None:
+    """Two networks hold the same rays and give the same rigorous answer for all points."""
+    assert accepted_rays(one) == accepted_rays(other)
+    a, b = (submin.open(path).query(bbox=(90, 30, 110, 40), policy="rigorous") for path in (one, other))
+    assert a.ids.tolist() == b.ids.tolist()
+    assert np.abs(a.geocentric - b.geocentric).max() < metres
+    sigma = np.sqrt(np.diag(a.covariance))
+    assert (np.abs(a.covariance - b.covariance) / sigma / sigma[:, None]).max() < relative
+
+
+def test_every_ray_is_in_one_cell(region: SimulatedRegion, base: Path) -> None:
+    image_ids = [image.image_id for image in region.images]
+    expected = {(str(region.point_ids[p]), image_ids[i]) for p, i in zip(region.point, region.image, strict=True)}
+    assert set(accepted_rays(base)) == expected
+
+
+def test_the_same_command_again_does_nothing(region: SimulatedRegion, catalogue: Path, base: Path) -> None:
+    before = Snapshot.open(str(base)).version
+    again = fuse(catalogue, base, area_of(region))
+    assert (again.fused, again.skipped, again.rejected) == (0, 12, ())
+    assert Snapshot.open(str(base)).version == before == again.version
+
+
+@pytest.mark.parametrize("batch_blocks", [1, 5])
+def test_batches_leave_the_same_network(region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path, batch_blocks: int) -> None:
+    network = tmp_path / "network"
+    result = fuse(catalogue, network, area_of(region), batch_blocks=batch_blocks)
+    assert result.fused == 12
+    assert len(versions(str(network))) == 1 + -(-12 // batch_blocks)
+    same_network(base, network, SECOND_ORDER, 1e-3)
+
+
+def test_shuffled_single_images_leave_the_same_network(region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path) -> None:
+    """Blocks of one image, in any order and in several batches: points wait for their second ray and move to their cell with it."""
+    parts = [part for block in Catalogue.open(catalogue).blocks() for part in by_image(block)]
+    order = np.random.default_rng(1).permutation(len(parts))
+    shuffled = rewrite(catalogue, tmp_path / "catalogue", [parts[k] for k in order])
+    network = tmp_path / "network"
+    assert fuse(shuffled, network, area_of(region), batch_blocks=10).fused == 36
+    same_network(base, network, SECOND_ORDER, 1e-3)
+
+
+def test_workers_leave_the_same_network(region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path) -> None:
+    network = tmp_path / "network"
+    with executor_for(2) as executor:
+        assert fuse(catalogue, network, area_of(region), executor=executor).fused == 12
+    same_network(base, network, 1e-8, 1e-10)
+
+
+def test_changed_content_and_returning_images_are_rejected(region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path) -> None:
+    blocks = list(Catalogue.open(catalogue).blocks())
+    moved = dataclasses.replace(blocks[0], sample=blocks[0].sample + 0.25)
+    stolen = [dataclasses.replace(image, block_id="other") for image in blocks[1].images]
+    other = dataclasses.replace(blocks[1], block_id="other", images=tuple(stolen))
+    version = Snapshot.open(str(base)).number
+    result = fuse(rewrite(catalogue, tmp_path / "catalogue", [moved, other, blocks[2]]), base, area_of(region))
+    assert (result.fused, result.skipped) == (0, 1)
+    reasons = {r.block_id: r.reason for r in result.rejected}
+    assert "already in the network with other content" in reasons[blocks[0].block_id]
+    assert f"already came in block {blocks[1].block_id}" in reasons["other"]
+    # the rejection is entered once
+    assert Snapshot.open(str(base)).number == version + 1
+    assert fuse(tmp_path / "catalogue", base, area_of(region)).rejected == result.rejected
+    assert Snapshot.open(str(base)).number == version + 1
+
+
+def test_a_bad_block_does_not_stop_the_others(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
+    blocks = list(Catalogue.open(catalogue).blocks())
+    line = blocks[3].line.copy()
+    line[7] = np.nan
+    blocks[3] = dataclasses.replace(blocks[3], line=line)
+    network = tmp_path / "network"
+    result = fuse(rewrite(catalogue, tmp_path / "catalogue", blocks), network, area_of(region))
+    assert result.fused == 11
+    assert [r.block_id for r in result.rejected] == [blocks[3].block_id]
+    assert str(blocks[3].point_ids[7]) in result.rejected[0].reason
+    assert "nan" in result.rejected[0].reason
+
+
+def test_one_id_at_two_places_rejects_the_later_block(region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path) -> None:
+    blocks = list(Catalogue.open(catalogue).blocks())
+    last = blocks[-1]
+    ids = last.point_ids.astype(object)
+    swapped = {ids[0]: "P-elsewhere"}
+    first = next(p for p in blocks[0].point_ids if p not in set(last.point_ids))
+    renamed = np.array([str(first) if p in swapped else str(p) for p in ids], dtype=np.str_)
+    blocks[-1] = dataclasses.replace(last, point_ids=renamed)
+    result = fuse(rewrite(catalogue, tmp_path / "catalogue", blocks), tmp_path / "network", area_of(region))
+    assert [r.block_id for r in result.rejected] == [last.block_id]
+    assert str(first) in result.rejected[0].reason
+    assert "km" in result.rejected[0].reason
+
+
+def test_readers_keep_their_version(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
+    network = tmp_path / "network"
+    blocks = list(Catalogue.open(catalogue).blocks())
+    fuse(rewrite(catalogue, tmp_path / "first", blocks[:6]), network, area_of(region))
+    reader = submin.open(network)
+    before = reader.query(bbox=(90, 30, 110, 40), policy="rigorous")
+    fuse(catalogue, network, area_of(region))
+    after = reader.query(bbox=(90, 30, 110, 40), policy="rigorous")
+    assert np.array_equal(before.covariance, after.covariance)
+    assert submin.open(network).version == "v2"
+    assert np.array_equal(submin.open(network).at("v1").query(bbox=(90, 30, 110, 40), policy="rigorous").covariance, before.covariance)

@@ -1,0 +1,203 @@
+"""Exact error covariance of a small network's answers, by dense linear algebra that shares no code with the library's.
+
+All accepted rays of a network, whitened and linearised where the network keeps them, and the a priori model are one linear problem,
+
+    y = A K u + B (x - x0) + v        0 = u + w        Cov v = I,  Cov w = I,  v and w independent,
+
+and every policy's estimate is a linear map of the data ``(y, 0)``. The error of the estimate is the same map of ``(v, w)``, so with F the rows of the map
+that belong to the points asked for, ``P_true = F F'``. Maps have 2 r + q columns: sample and line of each of r rays, then the q whitened image
+parameters' a priori values.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+from numpy.typing import NDArray
+
+from submin.network.network_image import NetworkImage
+from submin.sensors import Ground, sensor_named
+from submin.storage.network import Network
+from submin.tiling.cover import Cover
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+RELEASED = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """A network's linear problem, without the rays of points that fewer than two rays see: those say nothing about anything else.
+
+    Attributes
+    ----------
+    by_images : (2 r, q) A K; by_ground : (2 r, 3 n) B; y : (2 r,)
+    row_cell : (2 r,) cell of the point of each row
+    point_ids : (n,) ascending; point_cell : (n,) their cells; origin : (n, 3) x0, geocentric metres
+    cover : tiles and cells
+    """
+
+    by_images: Array
+    by_ground: Array
+    y: Array
+    row_cell: NDArray[np.int64]
+    point_ids: NDArray[np.str_]
+    point_cell: NDArray[np.int64]
+    origin: Array
+    cover: Cover
+
+    @property
+    def whitened(self) -> int:
+        """Number q of whitened image parameters."""
+        return self.by_images.shape[1]
+
+    @property
+    def data(self) -> Array:
+        """What maps act on: (y, 0)."""
+        return np.concatenate([self.y, np.zeros(self.whitened)])
+
+    def held(self, tiles: Iterable[int]) -> NDArray[np.int64]:
+        """Cells that any of some tiles holds."""
+        return np.unique(np.concatenate([np.array(self.cover.cells_held(tile), dtype=np.int64) for tile in tiles]))
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What some rays and the a priori model say of the whitened image parameters: ``root u = map (y, 0)``, information ``root' root``."""
+
+    root: Array
+    map: Array
+
+
+def equations(network: Network) -> Equations:
+    """The linear problem of a network, from the rays, linearisation and images that it keeps."""
+    images = network.snapshot.images()
+    ellipsoid = network.snapshot.metadata.ellipsoid
+    factor = a_priori_factor(images)
+    p = factor.shape[0] // len(images)
+    by_images, by_ground, y, ids, cell_of_point, origin, point_of_row, row_cell = [], [], [], [], [], [], [], []
+    for number in network.cell_numbers():
+        cell = network.cell(number)
+        count = np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell))
+        rays = cell.rays.take(cell.rays.accepted & (count >= 2)[cell.rays.point])
+        of_cell = [images[row] for row in cell.images]
+        assert {image.sensor for image in of_cell} <= {"rpc"}
+        sensor = sensor_named("rpc")
+        cameras = np.stack([sensor.pack(json.loads(i.camera), i.width, i.height) for i in of_cell])
+        projection = sensor.project(cameras, cell.theta, Ground.at(cell.linearised_at, ellipsoid), rays.image, rays.point)
+        moved = (cell.linearised_at - cell.origin)[rays.point]
+        reduced = (
+            rays.observed - projection.image
+            + (projection.by_parameters @ cell.theta[rays.image][:, :, None])[:, :, 0]
+            + (projection.by_ground @ moved[:, :, None])[:, :, 0]
+        )  # fmt: skip
+        rows_of_image = p * cell.images[rays.image][:, None] + np.arange(p)
+        by_images.append((projection.by_parameters @ factor[rows_of_image] / rays.sigma[:, :, None]).reshape(-1, factor.shape[1]))
+        by_ground.append((projection.by_ground / rays.sigma[:, :, None]).reshape(-1, 3))
+        y.append((reduced / rays.sigma).ravel())
+        seen = np.flatnonzero(count >= 2)
+        point_of_row.append(np.repeat(np.searchsorted(seen, rays.point) + sum(len(i) for i in ids), 2))
+        row_cell.append(np.full(2 * len(rays), number))
+        ids.append(cell.point_ids[seen])
+        cell_of_point.append(np.full(len(seen), number))
+        origin.append(cell.origin[seen])
+    names = np.concatenate(ids)
+    order = np.argsort(names)
+    place = np.argsort(order)[np.concatenate(point_of_row)]
+    narrow = np.concatenate(by_ground)
+    wide = np.zeros((len(narrow), 3 * len(names)))
+    np.put_along_axis(wide, 3 * place[:, None] + np.arange(3), narrow, axis=1)
+    return Equations(
+        np.concatenate(by_images), wide, np.concatenate(y), np.concatenate(row_cell), names[order],
+        np.concatenate(cell_of_point)[order], np.concatenate(origin)[order], network.cover,
+    )  # fmt: skip
+
+
+def a_priori_factor(images: Sequence[NetworkImage]) -> Array:
+    """K (m p, q), dense: own parts of the images of a block by a Cholesky factor of their correlation, then two columns a pass."""
+    m, p = len(images), sensor_named("rpc").parameters
+    bias = np.isin(np.arange(p), sensor_named("rpc").bias)
+    models = [json.loads(image.a_priori) for image in images]
+    passes = list(dict.fromkeys(image.pass_id for image in images))
+    factor = np.zeros((m, p, m * p + 2 * len(passes)))
+    for block in dict.fromkeys(image.block_id for image in images):
+        members = [i for i, image in enumerate(images) if image.block_id == block]
+        model, seconds = models[members[0]], np.array([images[i].seconds for i in members])
+        correlation = np.eye(len(members))
+        if model["correlation"] == "exponential":
+            correlation = np.exp(-np.abs(seconds[:, None] - seconds) / model["correlation_parameter"])
+        else:
+            assert model["correlation"] == "none"
+        root = np.linalg.cholesky(correlation)
+        own = np.where(bias, model["bias_px"] * np.sqrt(1.0 - model["common_to_pass"]), model["drift_px"])
+        for a, i in enumerate(members):
+            for b, k in enumerate(members):
+                factor[i, np.arange(p), p * k + np.arange(p)] = root[a, b] * own * (RELEASED if images[i].released else 1.0)
+    for i, image in enumerate(images):
+        column = m * p + 2 * passes.index(image.pass_id)
+        factor[i, np.flatnonzero(bias), [column, column + 1]] = models[i]["bias_px"] * np.sqrt(models[i]["common_to_pass"])
+    return factor.reshape(m * p, -1)
+
+
+def information(problem: Equations, cells: NDArray[np.int64]) -> Information:
+    """All rays of the points of some cells with the whole a priori model, ground points eliminated: one QR factorisation, ground first."""
+    rows = np.isin(problem.row_cell, cells)
+    ground = np.repeat(np.isin(problem.point_cell, cells), 3)
+    q, n = problem.whitened, int(ground.sum())
+    design = np.block([
+        [problem.by_ground[np.ix_(rows, ground)], problem.by_images[rows]],
+        [np.zeros((q, n)), np.eye(q)],
+    ])  # fmt: skip
+    orthogonal, triangle = la.qr(design, mode="economic")
+    columns = np.concatenate([np.flatnonzero(rows), len(rows) + np.arange(q)])
+    linear_map = np.zeros((q, len(rows) + q))
+    linear_map[:, columns] = orthogonal[:, n:].T
+    return Information(triangle[n:, n:], linear_map)
+
+
+def adjusted_together(problem: Equations, tiles: Sequence[int], weights: Array) -> Array:
+    """Map (q, 2 r + q) to the images from the a priori model and every cell that any of the tiles holds, each counted once."""
+    of_tiles = information(problem, problem.held(tiles))
+    return np.asarray(la.solve_triangular(of_tiles.root, of_tiles.map))
+
+
+def intersected(problem: Equations, tiles: Sequence[int], weights: Array) -> Array:
+    """Map to the images by Covariance Intersection of the tiles' own adjustments, each with the a priori model of all images."""
+    return weighted_sum([information(problem, problem.held([tile])) for tile in tiles], weights)
+
+
+def weighted_sum(parts: Sequence[Information], weights: Sequence[float] | Array) -> Array:
+    """Map to the images from weighted information of several estimates; all weights 1 is the naive independent merge."""
+    whole = sum(weight * part.root.T @ part.root for part, weight in zip(parts, weights, strict=True))
+    right = sum(weight * part.root.T @ part.map for part, weight in zip(parts, weights, strict=True))
+    return np.asarray(la.solve(whole, right, assume_a="pos"))
+
+
+def located(problem: Equations, images: Array, ids: NDArray[np.str_]) -> Array:
+    """Map (3 n, 2 r + q) to ground points, each the best fit of its own rays to the images' estimate."""
+    points = np.isin(problem.point_ids, ids)
+    assert points.sum() == len(ids)
+    by_ground = problem.by_ground[:, np.repeat(points, 3)]
+    rows = np.flatnonzero(by_ground.any(axis=1))
+    orthogonal, triangle = la.qr(by_ground[rows], mode="economic")
+    residual = -problem.by_images[rows] @ images
+    residual[np.arange(len(rows)), rows] += 1.0
+    return np.asarray(la.solve_triangular(triangle, orthogonal.T @ residual))
+
+
+def monolithic(problem: Equations) -> tuple[Array, Array]:
+    """Positions (n, 3) and joint covariance (3 n, 3 n) of all points by one least-squares adjustment of all unknowns."""
+    q, n = problem.whitened, len(problem.point_ids)
+    design = np.block([[problem.by_images, problem.by_ground], [np.eye(q), np.zeros((q, 3 * n))]])
+    inverse = np.linalg.pinv(design)[q:]
+    return problem.origin + (inverse @ problem.data).reshape(n, 3), inverse @ inverse.T
+
+
+def largest_ratio(true: Array, reported: Array) -> float:
+    """Largest true variance over reported variance of any linear function of the points: at most 1 for a consistent answer."""
+    size = len(reported)
+    return float(la.eigh(true, reported, eigvals_only=True, subset_by_index=[size - 1, size - 1])[0])
