@@ -167,8 +167,8 @@ def run(
             f"{result.rays_used:,} rays used, {result.rays_rejected:,} rejected as blunders, RMS {result.ray_rms_px:.3f} px; "
             f"{result.seconds:.1f} s, {result.peak_memory_mb:.0f} MB"
         )
-    elif not result.rejected:
-        lines.append("nothing is left to do")
+    if not result.fused and not result.rejected:
+        lines[0] = f"{network} {result.version}: nothing is left to do, all {result.skipped} blocks are in the network"
     lines += [f"bad camera {f.image_id}: {f.reason}" for f in result.flagged]
     lines += [f"rejected block {r.block_id}: {r.reason}" for r in result.rejected]
     lines += [f"tile {t}: the judgement of its rays did not settle; they are used as last judged" for t in result.unsettled_tiles]

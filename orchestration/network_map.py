@@ -355,7 +355,8 @@ def _draw_histogram(axes: Axes, points: PointAccuracy) -> None:
         return
     both = np.concatenate([points.ce90, points.le90])
     low, high = float(both.min()), max(float(np.percentile(v, 99.0)) for v in (points.ce90, points.le90))
-    edges = np.linspace(low, max(high, low * 1.02 + 1e-6), 49)
+    margin = max(0.03 * (high - low), 0.01 * low, 1e-6)
+    edges = np.linspace(max(low - margin, 0.0), high + margin, 49)
     for values, colour, name in ((points.ce90, HORIZONTAL, "CE90"), (points.le90, VERTICAL, "LE90")):
         median = float(np.median(values))
         counts, _ = np.histogram(values, edges)

@@ -15,7 +15,7 @@ from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.errors import QueryError
 from submin.network.cell import Cell
-from submin.network.network_image import image_set
+from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import SubMin
 from submin.query.control_set import ControlSet
 from submin.query.planner import Answer, answer, points_in_area, points_named, points_of_tile, well_spread
@@ -40,6 +40,7 @@ class Network:
     def __init__(self, place: str, version: str | None = None) -> None:
         self._snapshot = Snapshot.open(place, version)
         self._cells: OrderedDict[int, Cell] = OrderedDict()
+        self._images: dict[int, NetworkImage] = {}
         self._numbers: tuple[int, ...] | None = None
 
     @property
@@ -157,8 +158,10 @@ class Network:
         return self._snapshot.sub_min(tile, images)
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
-        """Images of these rows."""
-        return image_set(self._snapshot.images(rows), self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
+        """Images of these rows; every image is read once."""
+        unread = [int(row) for row in rows if int(row) not in self._images]
+        self._images.update(zip(unread, self._snapshot.images(unread), strict=True))
+        return image_set([self._images[int(row)] for row in rows], self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
 
     def _control_set(self, found: Answer) -> ControlSet:
         metadata, cover = self._snapshot.metadata, self.cover

@@ -32,6 +32,7 @@ from submin.tiling.cover import Cover
 
 icechunk.set_logs_filter("icechunk=error")
 BRANCH = "main"
+READ_OVER_ROWS = 256
 
 
 @dataclass(frozen=True)
@@ -177,9 +178,13 @@ class Snapshot:
             return network_images(read_table(table, wanted))
         if not len(rows):
             return []
-        low, high = int(min(rows)), int(max(rows)) + 1
-        span = network_images(read_table(table, wanted, low, high))
-        return [span[int(r) - low] for r in rows]
+        wanted_rows = np.asarray(rows, dtype=np.int64)
+        found: list[NetworkImage] = []
+        # a run of neighbours is one read of each column; a long gap between them is not read
+        for run in np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1):
+            span = network_images(read_table(table, wanted, int(run[0]), int(run[-1]) + 1))
+            found.extend(span[int(row) - int(run[0])] for row in run)
+        return found
 
     def image_columns(self, wanted: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns of the image table."""

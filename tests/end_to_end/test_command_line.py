@@ -1,0 +1,133 @@
+"""The commands of interface and README, as a user gives them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from orchestration.cli import main
+
+
+class Shell:
+    """Runs commands in this process and keeps what they print."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._patch, self._capture = monkeypatch, capsys
+
+    def __call__(self, *words: object, code: int = 0) -> tuple[str, str]:
+        """Standard output and standard error of ``submin WORDS``; its exit code must be ``code``."""
+        self._patch.setattr(sys, "argv", ["submin", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+            raise SystemExit(0)
+        printed = self._capture.readouterr()
+        assert (ended.value.code or 0) == code, printed.err + printed.out
+        return printed.out, printed.err
+
+    def json(self, *words: object, code: int = 0) -> dict[str, Any]:
+        """The one JSON object of ``submin WORDS --json``."""
+        out, _ = self(*words, "--json", code=code)
+        values = json.loads(out)
+        assert isinstance(values, dict)
+        return values
+
+
+@pytest.fixture
+def shell(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Shell:
+    return Shell(monkeypatch, capsys)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("commands")
+
+
+def test_the_main_job(shell: Shell, place: Path) -> None:
+    """Simulate, create, run, run again, query, check, map, info, history: the way of the README."""
+    catalogue, network = place / "catalogue", place / "network"
+    made = shell.json("simulate", "region", "--out", catalogue, "--scale", 0.09)
+    assert made["simulated"] is True
+    created = shell.json("create", network, "--fit", catalogue, "--tile-km", 60, "--overlap-km", 20)
+    assert (created["tile_km"], created["overlap_km"]) == (60.0, 20.0)
+
+    first = shell.json("run", catalogue, network)
+    assert first["version"] == "v1"
+    assert first["blocks_fused"] == made["blocks"]
+    assert first["blocks_rejected"] == []
+    assert [flag["image_id"] for flag in first["images_flagged"]] == made["bad_cameras"]
+    assert first["rays_used"] + first["rays_rejected"] == made["rays"]
+    assert 0.3 < first["ray_rms_px"] < 0.5
+    assert first["peak_memory_mb"] > 0
+    again = shell.json("run", catalogue, network)
+    assert (again["blocks_fused"], again["blocks_skipped"], again["version"]) == (0, made["blocks"], "v1")
+    assert again["ray_rms_px"] == first["ray_rms_px"]
+    assert "nothing is left to do" in shell("run", catalogue, network)[0]
+
+    asked = shell.json("query", network, "--bbox", 99, 34, 101, 36, "--policy", "rigorous", "--out", place / "control.npz")
+    assert asked["policy"] == "rigorous"
+    assert asked["scope"] == "network"
+    control = np.load(place / "control.npz")
+    assert control["covariance"].shape == (3 * asked["points"], 3 * asked["points"])
+    np.linalg.cholesky(control["covariance"])
+    for suffix in ("parquet", "geojson", "csv"):
+        shell("query", network, "--tile", asked["tiles"][0], "--out", place / f"control.{suffix}")
+        assert (place / f"control.{suffix}").stat().st_size > 1000
+    (place / "some.txt").write_text("\n".join(control["ids"][:5]))
+    assert shell.json("query", network, "--points", place / "some.txt")["points"] == 5
+    assert shell.json("query", network, "--bbox", 99, 34, 101, 36, "--max-points", 30)["points"] <= 30
+
+    checked = shell.json("check", network, catalogue / "check.parquet")
+    assert checked["points"] == asked["points"]
+    assert set(checked["areas"]) == {"NE", "NW", "SE", "SW"}
+    assert checked["horizontal"]["p50"] < checked["horizontal"]["mean_ce90"]
+    shell("map", network, "--out", place / "network.png")
+    assert (place / "network.png").read_bytes().startswith(b"\x89PNG")
+    described = shell.json("info", network)
+    assert described["points"] == asked["points"]
+    assert described["blocks"] == made["blocks"]
+    assert [v["version"] for v in shell.json("history", network)["versions"]] == ["v1", "v0"]
+
+
+def test_a_query_outside_is_empty_and_says_so(shell: Shell, place: Path) -> None:
+    out, _ = shell("query", place / "network", "--bbox", 10, 10, 11, 11)
+    assert "no determined points there" in out
+    assert shell.json("query", place / "network", "--bbox", 10, 10, 11, 11)["points"] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["query", "nowhere", "--bbox", 0, 0, 1, 1], "nowhere: no such network; make one with 'submin create'"),
+        (["query", "{network}", "--bbox", 34, 99, 36, 101], "longitude and latitude look swapped"),
+        (["query", "{network}", "--bbox", 99, 34, 101, 36, "--policy", "best"], "policy is 'best'; expected one of auto, tile, ci, rigorous"),
+        (["query", "{network}", "--bbox", 99, 34, 101, 36, "--at", "v9"], "version is 'v9'; expected one of v0 to v1"),
+        (["query", "{network}", "--tile", "r9"], "tile is 'r9'"),
+        (["query", "{network}"], "expected one of bbox, area, points, or a tile"),
+        (["query", "{network}", "--bbox", 99, 34, 101, 36, "--out", "{network}/../x.xls"], ".parquet"),
+        (["create", "{network}", "--bbox", 99, 34, 101, 36], "already exists"),
+        (["create", "{new}", "--bbox", 99, 34, 101, 36, "--tile-km", 50, "--overlap-km", 50], "less than the core's"),
+        (["create", "{new}", "--bbox", 99, 34, 101, 36, "--tile-km", 0.001, "--overlap-km", 0], "choose a larger --tile-km"),
+        (["create", "{new}"], "exactly one of --bbox, --aoi and --fit"),
+        (["run", "nocatalogue", "{network}"], "nocatalogue: no such folder"),
+        (["run", "{catalogue}", "nowhere"], "nowhere: no such network"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_writes_nothing(shell: Shell, place: Path, words: list[object], said: str) -> None:
+    names = {"network": place / "network", "catalogue": place / "catalogue", "new": place / "new"}
+    filled = [word.format(**names) if isinstance(word, str) else word for word in words]
+    _, err = shell(*filled, code=2)
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (place / "new").exists()
+    assert json.loads(shell(*filled, "--json", code=2)[0])["error"]
+
+
+def test_frames_that_do_not_match_are_refused(shell: Shell, place: Path) -> None:
+    shell("create", place / "moon", "--bbox", 99, 34, 101, 36, "--frame", "ITRF2014")
+    _, err = shell("run", place / "catalogue", place / "moon", code=2)
+    assert "frame is 'WGS84', but the network's is 'ITRF2014'" in err
+    assert shell.json("info", place / "moon")["version"] == "v0"
