@@ -1,1 +1,1 @@
-"""Benchmarks: one file a claim."""
+"""Benchmarks: one file a claim. ``python -m benchmarks`` lists them, ``python -m benchmarks NAME`` runs one."""

@@ -20,6 +20,8 @@ from submin.adjustment.rays import Rays
 Array = NDArray[np.float64]
 
 ROBUST_ITERATIONS = 6
+SETTLED_WEIGHT = 0.02
+"""Robust weights that change less have done their work."""
 MAX_ITERATIONS = 40
 FREE_DECISIONS = 12
 """Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
@@ -72,10 +74,13 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     ground, anchor = start.copy(), start if registered is None else registered
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
-    for _ in range(ROBUST_ITERATIONS):
+    robust = 0
+    for robust in range(1, ROBUST_ITERATIONS + 1):
         linear, estimate, ground = _step(images, rays, theta, ground, anchor, weight)
         theta = estimate.theta
-        weight = robust_weights(linear, candidates, theta)
+        before, weight = weight, robust_weights(linear, candidates, theta)
+        if np.abs(weight - before).max(initial=0.0) < SETTLED_WEIGHT:
+            break
 
     weight = (weight > 0.05).astype(np.float64)
     released = np.zeros(len(images), dtype=bool)
@@ -103,7 +108,7 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     final = linearise(images, rays, theta, ground, ground)
     return Adjustment(
         theta, ground, weight > 0.0, statistic, released, image_statistic, residuals(final, weight, theta), converged,
-        iteration + ROBUST_ITERATIONS,
+        iteration + robust,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg as la
@@ -22,13 +23,29 @@ class ImageEstimate:
     Attributes
     ----------
     theta : (m, p) corrections
-    covariance : (m p, m p) their covariance M, both triangles
     chi_square : weighted sum of squares of residuals, a priori model included
+    factor : (q, q) lower Cholesky factor of the information about the whitened vectors u
+    prior : (m p, q) a priori factor K
     """
 
     theta: Array
-    covariance: Array
     chi_square: float
+    factor: Array
+    prior: sp.csr_array
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance M (m p, m p) of ``theta``, both triangles; made when first asked for, since most iterations do not need it.
+
+        Raises
+        ------
+        NumericalError
+            When the factor is not that of a regular matrix.
+        """
+        inverse, info = la.lapack.dpotri(self.factor, lower=1)
+        if info != 0:
+            raise NumericalError(f"the information matrix ({len(self.factor)} parameters) cannot be inverted")
+        return np.asarray(self.prior @ (self.prior @ fill_symmetric(np.asarray(inverse))).T)
 
 
 MIRROR_BLOCK = 256
@@ -77,13 +94,9 @@ def estimate_images(sums: Sums, prior: sp.csr_array, parameters: int) -> ImageEs
     factor = cholesky(reduced_information(sums.information, prior))
     right = prior.T @ sums.vector
     u, _ = la.lapack.dpotrs(factor, right, lower=1)
-    inverse, info = la.lapack.dpotri(factor, lower=1, overwrite_c=1)
-    if info != 0:
-        raise NumericalError(f"the information matrix ({len(factor)} parameters) cannot be inverted")
-    covariance = prior @ (prior @ fill_symmetric(np.asarray(inverse))).T
     theta = np.asarray(prior @ u).reshape(-1, parameters)
     # f + |u|^2 at the minimum equals f - h'theta
-    return ImageEstimate(theta, np.asarray(covariance), float(sums.misclosure - sums.vector @ theta.ravel()))
+    return ImageEstimate(theta, float(sums.misclosure - sums.vector @ theta.ravel()), factor, prior)
 
 
 def prior_variance(prior: sp.csr_array, parameters: int) -> Array:

