@@ -1,7 +1,7 @@
 """Main job: the rate of every station from rays to a committed network, on a simulated region.
 
-Kernels are compared with what bounds them in the same run: the factorisation with LAPACK's plain Cholesky of the same size, the rest with a copy of
-the same numbers through memory.
+Kernels are compared with what bounds them in the same run: the factorisation with LAPACK's plain Cholesky of the same size, the rest with
+a copy of the same numbers through memory.
 """
 
 from __future__ import annotations

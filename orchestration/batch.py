@@ -1,7 +1,7 @@
 """One batch of blocks into the network: register, adjust, sum, factor, and one commit.
 
-The coordinator decides and commits; workers compute and write to forks of its session (docs/architecture.md). A crash anywhere before the commit
-leaves the last version as it is.
+The coordinator decides and commits; workers compute and write to forks of its session (docs/architecture.md). A crash anywhere before the
+commit leaves the last version as it is.
 """
 
 from __future__ import annotations
@@ -149,7 +149,9 @@ def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Regist
     bad: dict[int, str] = {}
     inside = np.bincount(rays.block[~registration.outside], minlength=len(blocks))
     for empty in np.flatnonzero(inside == 0):
-        bad[int(empty)] = "the block lies wholly outside the area of the network; check the axis order, or create a network whose area holds it"
+        bad[int(empty)] = (
+            "the block lies wholly outside the area of the network; check the axis order, or create a network whose area holds it"
+        )
     far = np.flatnonzero(registration.misfit > SAME_POINT_METRES)
     if len(far):
         # two rays of one id that disagree: the later block is in error
@@ -164,7 +166,12 @@ def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Regist
 
 
 def _fuse(
-    session: icechunk.Session, base: Snapshot, registration: Registration, images: list[NetworkImage], executor: Executor, reporter: Reporter
+    session: icechunk.Session,
+    base: Snapshot,
+    registration: Registration,
+    images: list[NetworkImage],
+    executor: Executor,
+    reporter: Reporter,
 ) -> tuple[list[TileReport], set[tuple[int, int]], list[icechunk.ForkSession]]:
     """Update and factor every tile that the batch touches; the reports of the tiles, all flags of images, and the writes."""
     cover = base.cover
@@ -209,9 +216,16 @@ def _tiles_that_see(base: Snapshot, rows: set[int]) -> set[int]:
 
 
 def _enter(
-    session: icechunk.Session, base: Snapshot, version: int, blocks: Sequence[Block], refused: Sequence[Rejected], images: Sequence[NetworkImage],
-    registration: Registration, flags: set[tuple[int, int]], cells: dict[int, CellReport],
-) -> None:  # fmt: skip
+    session: icechunk.Session,
+    base: Snapshot,
+    version: int,
+    blocks: Sequence[Block],
+    refused: Sequence[Rejected],
+    images: Sequence[NetworkImage],
+    registration: Registration,
+    flags: set[tuple[int, int]],
+    cells: dict[int, CellReport],
+) -> None:
     """Write what the coordinator keeps: images, ledger, directory, version."""
     root = zarr.open_group(session.store, mode="r+")
     first = base.image_count()

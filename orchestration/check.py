@@ -1,4 +1,4 @@
-"""A network against check points: are its coordinates right, and is its stated accuracy true?"""
+"""A network against check points: whether its coordinates are right, and its stated accuracy true."""
 
 from __future__ import annotations
 

@@ -29,7 +29,9 @@ app.add_typer(simulate_app, name="simulate")
 out = Console(highlight=False)
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
-Box = Annotated[tuple[float, float, float, float] | None, typer.Option("--bbox", metavar="W S E N", help="West, south, east, north in degrees.")]
+Box = Annotated[
+    tuple[float, float, float, float] | None, typer.Option("--bbox", metavar="W S E N", help="West, south, east, north in degrees.")
+]
 Aoi = Annotated[Path | None, typer.Option("--aoi", help="GeoJSON file with the area.")]
 Workers = Annotated[int, typer.Option("--workers", min=0, help="Processes of a local Dask cluster; 0 runs without one.")]
 Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")]
@@ -45,7 +47,9 @@ def show(values: dict[str, Any], as_json: bool, text: str) -> None:
 
 @import_app.command("rpc")
 def import_rpc_command(
-    images: Annotated[Path, typer.Option("--images", help="CSV with image_id and, where known, acquisition_utc, width, height, col0, row0, rpc.")],
+    images: Annotated[
+        Path, typer.Option("--images", help="CSV with image_id and, where known, acquisition_utc, width, height, col0, row0, rpc.")
+    ],
     rpc: Annotated[Path, typer.Option("--rpc", help="Folder of the RPC files.")],
     tracks: Annotated[Path, typer.Option("--tracks", help="CSV with track_id, image_id, col, row.")],
     catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")],
@@ -93,7 +97,8 @@ def simulate_region_command(
     write_region(region, catalogue)
     values = {
         "catalogue": str(catalogue), "simulated": True, "images": len(region.images), "blocks": len({i.block_id for i in region.images}),
-        "points": len(region.point_ids), "rays": len(region.image), "blunders": int(region.blunder.sum()), "bad_cameras": list(region.bad_cameras),
+        "points": len(region.point_ids), "rays": len(region.image), "blunders": int(region.blunder.sum()),
+        "bad_cameras": list(region.bad_cameras),
     }  # fmt: skip
     show(values, as_json, f"{catalogue}: simulated {values['images']} images in {values['blocks']} blocks, {values['points']:,} points, "
          f"{values['rays']:,} rays, of which {values['blunders']} blunders; bad camera: {', '.join(region.bad_cameras)}")  # fmt: skip
@@ -104,7 +109,9 @@ def create(
     network: Annotated[str, typer.Argument(help="Folder or s3:// URL of the new network.")],
     bbox: Box = None,
     aoi: Aoi = None,
-    fit: Annotated[Path | None, typer.Option("--fit", help="Catalogue whose footprints give the area, and tile sizes that suit them.")] = None,
+    fit: Annotated[
+        Path | None, typer.Option("--fit", help="Catalogue whose footprints give the area, and tile sizes that suit them.")
+    ] = None,
     tile_km: Annotated[float | None, typer.Option("--tile-km", help="Side of a core; default 100, or 4 footprints with --fit.")] = None,
     overlap_km: Annotated[float | None, typer.Option("--overlap-km", help="Width that neighbours share, below the core's.")] = None,
     form: Annotated[str, typer.Option("--form", help="Form of the sub-MINs.")] = "factored",
@@ -182,12 +189,16 @@ def query(
     network: Annotated[str, typer.Argument(help="Network to ask.")],
     bbox: Box = None,
     aoi: Aoi = None,
-    points: Annotated[Path | None, typer.Option("--points", help="CSV or Parquet with a column point_id, or text with one id a line.")] = None,
+    points: Annotated[
+        Path | None, typer.Option("--points", help="CSV or Parquet with a column point_id, or text with one id a line.")
+    ] = None,
     tile: Annotated[str | None, typer.Option("--tile", help="Name of a tile: its sub-MIN alone.")] = None,
     policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "auto",
     at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
     max_points: Annotated[int | None, typer.Option("--max-points", min=1, help="At most so many points, well spread.")] = None,
-    output: Annotated[Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Control points of an area, with their joint covariance.
@@ -316,7 +327,9 @@ def history(network: Annotated[str, typer.Argument(help="Network.")], as_json: J
     from submin.storage.network_store import versions
 
     found = versions(network)
-    values = {"versions": [{"version": v.name, "written": v.written.isoformat(), "message": v.message, "snapshot": v.snapshot} for v in found]}
+    values = {
+        "versions": [{"version": v.name, "written": v.written.isoformat(), "message": v.message, "snapshot": v.snapshot} for v in found]
+    }
     show(values, as_json, "\n".join(f"{v.name:>6}  {v.written:%Y-%m-%d %H:%M:%S}  {v.message}" for v in found))
 
 

@@ -20,8 +20,7 @@ from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
 from submin.errors import SubminError
 from submin.geodesy import Ellipsoid
-from submin.network.cell import Cell, NewRays, bundle, second_order, summed, union_of_images, with_rays, without_points
-from submin.network.cell import SECOND_ORDER_PIXELS
+from submin.network.cell import SECOND_ORDER_PIXELS, Cell, NewRays, bundle, second_order, summed, union_of_images, with_rays, without_points
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import add_sums, factor
 from submin.storage.network_store import Snapshot
@@ -145,8 +144,8 @@ def update_tile(
 ) -> TileUpdate:
     """Judge the rays that a tile holds, and sum its own cells.
 
-    All rays that the tile holds are adjusted together (they include the neighbours' rays in shared cells); the tile decides only for the points of its
-    own core. An own cell is summed again when its rays, decisions or linearisation changed.
+    All rays that the tile holds are adjusted together (they include the neighbours' rays in shared cells); the tile decides only for the
+    points of its own core. An own cell is summed again when its rays, decisions or linearisation changed.
     """
     root = zarr.open_group(writes.store, mode="r+")
     snapshot = Snapshot(root, "network")
@@ -161,7 +160,8 @@ def update_tile(
     # a cell that has lost its last point is kept here, so that its empty state is written
     held = [cell for cell in cells.values() if len(cell) or cell.number in departures]
     rows = union_of_images(held)
-    # every ray and image is judged afresh, also one rejected or released on less evidence: decisions follow from the rays, not from their order
+    # every ray and image is judged afresh, also one rejected or released on less evidence: decisions follow from the rays, not from their
+    # order
     judged_images = [replace(image, released=False) for image in _images(snapshot, rows, new_images)]
     images = image_set(judged_images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters)
     rays, registered = bundle(held, rows)
@@ -219,7 +219,11 @@ def factor_tile(
     rows = np.unique(np.concatenate([part[0] for part in parts])).astype(np.int32)
     gone = set(released)
     images = [replace(image, released=int(row) in gone) for row, image in zip(rows, _images(snapshot, rows, new_images), strict=True)]
-    sub_min = factor(add_sums(parts, rows, snapshot.metadata.parameters), rows, image_set(images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters))
+    sub_min = factor(
+        add_sums(parts, rows, snapshot.metadata.parameters),
+        rows,
+        image_set(images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters),
+    )
     write_sub_min(root, snapshot.cover.tile_name(tile), sub_min, cells)
     return TileFactored(tile, len(rows), writes)
 
@@ -238,7 +242,14 @@ def _report(cell: Cell) -> CellReport:
 
 
 def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> tuple[FlaggedImage, ...]:
-    names = ("sample bias", "sample drift along samples", "sample drift along lines", "line bias", "line drift along samples", "line drift along lines")
+    names = (
+        "sample bias",
+        "sample drift along samples",
+        "sample drift along lines",
+        "line bias",
+        "line drift along samples",
+        "line drift along lines",
+    )
     flagged = []
     # a judgement that has not come to rest names nobody
     for k in np.flatnonzero(result.released & result.converged):

@@ -1,7 +1,7 @@
 """Adjustment of a bundle of rays: Gauss-Newton with a robust start, blunders rejected, bad cameras named.
 
-The same function serves stage 1 (one block, free of any network) and the judgement of a sub-MIN's rays (all that a tile holds). Its result is the
-accepted rays, the released cameras, and the state at which to linearise; never a dense covariance of ground points.
+The same function serves stage 1 (one block, free of any network) and the judgement of a sub-MIN's rays (all that a tile holds). Its
+result is the accepted rays, the released cameras, and the state at which to linearise; never a dense covariance of ground points.
 """
 
 from __future__ import annotations
@@ -74,8 +74,9 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     ground, anchor = start.copy(), start if registered is None else registered
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
-    robust = 0
-    for robust in range(1, ROBUST_ITERATIONS + 1):
+    iteration = 0
+    while iteration < ROBUST_ITERATIONS:
+        iteration += 1
         linear, estimate, ground = _step(images, rays, theta, ground, anchor, weight)
         theta = estimate.theta
         before, weight = weight, robust_weights(linear, candidates, theta)
@@ -86,15 +87,15 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     released = np.zeros(len(images), dtype=bool)
     image_statistic = np.zeros(len(images))
     statistic = np.zeros(len(rays))
-    converged, iteration = False, 0
-    while not converged and iteration < MAX_ITERATIONS:
-        iteration += 1
+    converged, judgements = False, 0
+    while not converged and judgements < MAX_ITERATIONS:
+        judgements += 1
         linear, estimate, reached = _step(images, rays, theta, ground, anchor, weight)
         step_px = np.abs(estimate.theta - theta).max(initial=0.0)
         step_m = np.abs(reached - ground).max(initial=0.0)
         theta, ground = estimate.theta, reached
         judged, statistic = reject_blunders(
-            linear, candidates if iteration <= FREE_DECISIONS else weight, theta, estimate.covariance
+            linear, candidates if judgements <= FREE_DECISIONS else weight, theta, estimate.covariance
         )  # fmt: skip
         worst = image_statistics(theta, estimate.covariance, prior_variance(images.prior, images.parameters))
         bad = bad_cameras(worst, linear) & ~released
@@ -108,14 +109,17 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     final = linearise(images, rays, theta, ground, ground)
     return Adjustment(
         theta, ground, weight > 0.0, statistic, released, image_statistic, residuals(final, weight, theta), converged,
-        iteration + robust,
+        iteration + judgements,
     )  # fmt: skip
 
 
 def _step(
     images: ImageSet, rays: Rays, theta: Array, ground: Array, anchor: Array, weight: Array
 ) -> tuple[LinearRays, ImageEstimate, Array]:
-    """One Gauss-Newton step: the linearised rays, the images' new estimate, and the points' new positions (n, 3), within reach of their anchors."""
+    """One Gauss-Newton step.
+
+    Returns the linearised rays, the images' new estimate, and the points' new positions (n, 3), within reach of their anchors.
+    """
     linear = linearise(images, rays, theta, ground, ground)
     estimate = estimate_images(eliminate(linear, weight, len(images)), images.prior, images.parameters)
     offset = ground + ground_corrections(point_factors(linear, weight), linear, estimate.theta) - anchor

@@ -1,8 +1,8 @@
 """Blunders: robust weights to begin with, then Baarda's test of every ray, and of every image against its a priori model.
 
-With whitened observations the residuals of a point's rays are ``v = P (y - A theta)``, ``P = I - QQ'`` (see `submin.adjustment.elimination`), of covariance
-``P - P A M A' P`` when ``theta`` has covariance M. The test statistic of one coordinate is ``w = v / sqrt(its variance)``, standard normal without
-blunders (Baarda 1968; docs/mathematics.md, "Quality assurance").
+With whitened observations the residuals of a point's rays are ``v = P (y - A theta)``, ``P = I - QQ'`` (see
+`submin.adjustment.elimination`), of covariance ``P - P A M A' P`` when ``theta`` has covariance M. The test statistic of one coordinate is
+``w = v / sqrt(its variance)``, standard normal without blunders (Baarda 1968; docs/mathematics.md, "Quality assurance").
 """
 
 from __future__ import annotations
@@ -66,7 +66,10 @@ def _snoop(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array,
     theta: Array, covariance: Array, critical: float, testable: float, statistic: Array,
 ) -> None:  # fmt: skip
-    """Test each point's rays, reject the worst, and again until none is left to reject. Changes ``weight``; ``statistic`` (r,) is each ray's last w."""
+    """Test each point's rays, reject the worst, and again until none is left to reject.
+
+    Changes ``weight``; ``statistic`` (r,) becomes each ray's last w.
+    """
     p = by_parameters.shape[2]
     most = _most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
@@ -147,10 +150,8 @@ def robust_weights(linear: LinearRays, weight: Array, theta: Array) -> Array:
 
 
 def residuals(linear: LinearRays, weight: Array, theta: Array) -> Array:
-    """Residuals (r, 2) of accepted rays in sigmas at these image corrections (m, p), each point at its best place; NaN for rejected rays."""
-    return np.asarray(
-        _residuals(linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta)[0]
-    )
+    """Residuals (r, 2) in sigmas at these image corrections (m, p), each point at its best place; NaN for rejected rays."""
+    return np.asarray(_residuals(linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta)[0])
 
 
 def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance: Array) -> tuple[Array, Array]:

@@ -1,14 +1,14 @@
 """Elimination of ground points from their rays, orthogonally, and what is left for the images.
 
-A point's whitened, linearised rays are ``y = A theta + B (x - x0) + v``, ``Cov v = I`` (all its rays stacked). With an orthonormal basis Q of the
-columns of B, ``B = Q R``:
+A point's whitened, linearised rays are ``y = A theta + B (x - x0) + v``, ``Cov v = I`` (all its rays stacked). With an orthonormal basis
+Q of the columns of B, ``B = Q R``:
 
     information left about the images   G = A'(I - QQ')A,  h = A'(I - QQ')y,  f = y'(I - QQ')y
     own part of the point               D = (R'R)^-1,  U = -R^-1 Q'A,  xbar = x0 + R^-1 Q'y
 
-so that, given an estimate of the images, ``x = xbar + U theta`` and ``P_ij = delta_ij D_j + U_i M U_j'`` (docs/mathematics.md, "Sources"). Q spans every
-direction above round-off; a weak direction is never dropped, because that would keep information that is not there. A single ray leaves G = 0:
-the point is pending.
+so that, given an estimate of the images, ``x = xbar + U theta`` and ``P_ij = delta_ij D_j + U_i M U_j'`` (docs/mathematics.md,
+"Sources"). Q spans every direction above round-off; a weak direction is never dropped, because that would keep information that is not
+there. A single ray leaves ``G = 0``: the point is pending.
 
 Only the lower triangle of the images' information is written.
 """
@@ -89,7 +89,10 @@ class PointFactors:
 
 
 def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, origin: Array) -> LinearRays:
-    """Linearise rays at image corrections ``theta`` (m, p) and ground ``linearised_at`` (n, 3), about the fixed ``origin`` (n, 3) of each point."""
+    """Linearise rays at image corrections ``theta`` (m, p) and ground positions ``linearised_at`` (n, 3).
+
+    ``origin`` (n, 3) is the fixed origin of each point's coordinates.
+    """
     ground = images.ground(linearised_at)
     projection = images.project(theta, ground, rays.image, rays.point)
     y = rays.observed - projection.image
@@ -107,7 +110,10 @@ def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, 
 
 @numba.njit(cache=True, error_model="numpy")
 def _orthonormal(b: Array, k: int, q: Array, r: Array, pivot: Index) -> int:
-    """Pivoted Gram-Schmidt, each step done twice, of the first k rows of b (k, 3): q (k, 3), r (3, 3) upper, columns in order ``pivot``. Returns the rank."""
+    """Pivoted Gram-Schmidt, each step done twice, of the first k rows of b (k, 3): q (k, 3), r (3, 3) upper.
+
+    ``pivot`` becomes the order of the columns. Returns the rank.
+    """
     for c in range(3):
         pivot[c] = c
         for i in range(k):

@@ -60,9 +60,7 @@ class ImageSet:
 
     def release(self, which: NDArray[np.bool_]) -> ImageSet:
         """The same images with the priors of some (m,) released: their positions are left to the network."""
-        return replace(
-            self, priors=tuple(replace(p, released=p.released or bool(w)) for p, w in zip(self.priors, which, strict=True))
-        )
+        return replace(self, priors=tuple(replace(p, released=p.released or bool(w)) for p, w in zip(self.priors, which, strict=True)))
 
     def ground(self, geocentric: Array) -> Ground:
         """Ground points (n, 3) in metres in the forms that sensors need."""

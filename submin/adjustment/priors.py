@@ -1,8 +1,10 @@
 """A priori model of the images' adjustable parameters, as a factor: what is believed of a camera before any measurement.
 
 The correction of an image is the sum of a part of its own and a part common to all images of its pass. Both are written by whitened vectors
-``u`` with covariance I (docs/mathematics.md, "Parameter vectors are held whitened"): ``theta = K u``, so the a priori covariance is ``Q = K K'`` and
-``Q^-1`` is never formed. Correlations between the images of a block are factored as *correlation* matrices, of which the nearly singular ones
+``u`` with covariance I (docs/mathematics.md, "Parameter vectors are held whitened"): ``theta = K u``, so the a priori covariance is ``Q =
+K K'`` and
+``Q^-1`` is never formed. Correlations between the images of a block are factored as *correlation* matrices, of which the nearly singular
+ones
 (images seconds apart) lose nothing: a negative computed eigenvalue is clipped to zero, which only says that two corrections are equal.
 """
 

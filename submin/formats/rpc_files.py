@@ -1,7 +1,7 @@
 """RPC files as camera descriptions with GDAL's names, which `submin.sensors.rpc` packs.
 
-Read are JSON with GDAL's names, JSON with the names of the Python package rpcm (perhaps under a key ``rpc``, beside other things), and text as in
-``*_RPC.TXT``, a line ``NAME: value unit`` each (GDAL, "RPCs in GeoTIFF"; STDI-0002, appendix E).
+Read are JSON with GDAL's names, JSON with the names of the Python package rpcm (perhaps under a key ``rpc``, beside other things), and
+text as in ``*_RPC.TXT``, a line ``NAME: value unit`` each (GDAL, "RPCs in GeoTIFF"; STDI-0002, appendix E).
 """
 
 from __future__ import annotations

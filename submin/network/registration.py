@@ -116,7 +116,9 @@ def register(
     if fresh.any():
         compact = np.cumsum(fresh) - 1
         chosen = fresh[every_point]
-        bundle = sorted_rays(compact[every_point[chosen]].astype(np.int32), local[chosen], observed[chosen], sigma[chosen], accepted[chosen])
+        bundle = sorted_rays(
+            compact[every_point[chosen]].astype(np.int32), local[chosen], observed[chosen], sigma[chosen], accepted[chosen]
+        )
         origin[fresh] = intersect(images, bundle, int(fresh.sum())).geocentric
         final[fresh] = np.bincount(every_point[accepted], minlength=count)[fresh] >= 2
     reached = np.isfinite(origin).all(axis=1)

@@ -2,8 +2,8 @@
 
     x_j = xbar_j + U_j theta        P_ij = delta_ij D_j + U_i M U_j'
 
-``theta`` and M, of the images that the tile sees, come from one factorisation of the summed cells; D, U and xbar of a point come from its own rays
-(docs/mathematics.md, "Factored form"). The dense covariance of all points is never formed.
+``theta`` and M, of the images that the tile sees, come from one factorisation of the summed cells; D, U and xbar of a point come from its
+own rays (docs/mathematics.md, "Factored form"). The dense covariance of all points is never formed.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def joint_covariance(loading: sp.csr_array, own: Array, covariance: Array) -> Ar
 
 
 def point_covariances(loading: sp.csr_array, own: Array, covariance: Array) -> Array:
-    """Covariance (n, 3, 3) of each point by itself, geocentric square metres, without the joint matrix. Arguments as in `joint_covariance`."""
+    """Covariance (n, 3, 3) of each point by itself, without the joint matrix; arguments as in `joint_covariance`."""
     n, chunk = len(own), 2048
     covariances = own.copy()
     for start in range(0, n, chunk):

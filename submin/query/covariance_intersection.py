@@ -5,9 +5,9 @@ Every tile is brought to the union of the images by padding with the prior: an i
 
     Lambda(w) = sum_t w_t Lambda_t = I + K' (sum_c omega_c S_c) K,     omega_c = sum of w_t over the tiles that hold cell c
 
-which counts no cell more than once whatever the tiles share, so ``P = D + U M(w) U'`` is consistent for all points jointly (docs/mathematics.md,
-"Covariance Intersection and bounded inflation in parameter space"). The weights minimise the trace of the covariance of the queried points, a convex
-function of w.
+which counts no cell more than once whatever the tiles share, so ``P = D + U M(w) U'`` is consistent for all points jointly
+(docs/mathematics.md, "Covariance Intersection and bounded inflation in parameter space"). The weights minimise the trace of the covariance
+of the queried points, a convex function of w.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ A ground point is normalised, ``L = (longitude - lon_off) / lon_scale`` and like
     sample_rpc = samp_off + samp_scale * p1(L, P, H) / p2(L, P, H)        line_rpc = line_off + line_scale * p3 / p4
 
 with cubic polynomials in the RPC00B order of terms: 1, L, P, H, LP, LH, PH, LL, PP, HH, PLH, LLL, LPP, LHH, LLP, PPP, PHH, LLH, PPH, HHH
-(STDI-0002, appendix E). The six adjustable parameters ``a0 a1 a2 b0 b1 b2``, in pixels, act on image coordinates scaled to -1..1 over the image,
-``s = (sample_rpc - centre) / half width`` and ``l`` likewise:
+(STDI-0002, appendix E). The six adjustable parameters ``a0 a1 a2 b0 b1 b2``, in pixels, act on image coordinates scaled to -1..1 over the
+image, ``s = (sample_rpc - centre) / half width`` and ``l`` likewise:
 
     sample = sample_rpc + a0 + a1 s + a2 l                                line = line_rpc + b0 + b1 s + b2 l
 
@@ -91,9 +91,7 @@ def _raw(camera: Array, geodetic: Array, sample: Array, line: Array) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _project(
-    cameras: Array, parameters: Array, geodetic: Array, jacobian: Array, image: Index, point: Index
-) -> tuple[Array, Array, Array]:
+def _project(cameras: Array, parameters: Array, geodetic: Array, jacobian: Array, image: Index, point: Index) -> tuple[Array, Array, Array]:
     rays = len(image)
     predicted = np.empty((rays, 2))
     by_ground = np.empty((rays, 2, 3))

@@ -20,7 +20,7 @@ TABLE_CHUNK = 1 << 16
 
 def group_of(parent: zarr.Group, name: str) -> zarr.Group:
     """A group inside another; raises `StoreError` when the store is damaged."""
-    found = parent[name] if name in parent else None
+    found = parent.get(name)
     if not isinstance(found, zarr.Group):
         raise StoreError(f"the store has no group {name!r}; it is damaged, or not a network")
     return found
@@ -28,7 +28,7 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
 
 def array_of(group: zarr.Group, name: str) -> zarr.Array[Any]:
     """An array of a group; raises `StoreError` when the store is damaged."""
-    found = group[name] if name in group else None
+    found = group.get(name)
     if not isinstance(found, zarr.Array):
         raise StoreError(f"the store has no array {name!r} in {group.path!r}; it is damaged")
     return found

@@ -254,16 +254,17 @@ class Block:
         shapes = {name: np.shape(getattr(self, name)) for name in ("point_ids", "image", *_MEASURED)}
         if len(set(shapes.values())) != 1 or len(shapes["image"]) != 1:
             raise InputError(f"block {self.block_id}: arrays have shapes {shapes}; expected one length, a ray each")
-        if len(self.image) and not (0 <= self.image.min() and self.image.max() < len(self.images)):
+        if len(self.image) and not (self.image.min() >= 0 and self.image.max() < len(self.images)):
             raise InputError(f"block {self.block_id}: image holds {self.image.max()}; expected indices into {len(self.images)} images")
 
     def __len__(self) -> int:
         return len(self.image)
 
     def content_hash(self) -> str:
-        """Hexadecimal BLAKE2b of what an adjustment of the block depends on: image ids, passes, cameras, sizes, times, a priori model and rays.
+        """Hexadecimal BLAKE2b of what an adjustment of the block depends on.
 
-        Neither the order of images or rays nor the layout of a camera's JSON text leaves a trace.
+        That is image ids, passes, cameras, sizes, times, the a priori model and the rays. Neither the order of images or rays nor the
+        layout of a camera's JSON text leaves a trace.
         """
         order = sorted(range(len(self.images)), key=lambda i: self.images[i].image_id)
         rank = np.empty(len(order), dtype="<i4")
@@ -312,7 +313,8 @@ def defects(block: Block) -> str | None:
     if block.a_priori.correlation in ("exponential", "gaussian"):
         for image in block.images:
             if not image.acquired:
-                return f"image {image.image_id} has no time; the {block.a_priori.correlation} correlation of the priors needs column 'acquired'"
+                model = block.a_priori.correlation
+                return f"image {image.image_id} has no time; the {model} correlation of the priors needs column 'acquired'"
     return None
 
 

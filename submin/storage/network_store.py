@@ -173,7 +173,10 @@ class Snapshot:
 
     def images(self, rows: Sequence[int] | NDArray[np.integer] | None = None) -> list[NetworkImage]:
         """Images of these rows (ascending), or all."""
-        table, wanted = group_of(self.root, "images"), [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")]
+        table, wanted = (
+            group_of(self.root, "images"),
+            [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")],
+        )
         if rows is None:
             return network_images(read_table(table, wanted))
         if not len(rows):

@@ -79,7 +79,8 @@ class NetworkMetadata:
             raise StoreError(f"{place}: not a network (its root has no 'submin' attributes); make one with 'submin create'")
         if values.get("format_version") != FORMAT_VERSION:
             raise StoreError(
-                f"{place}: format version {values.get('format_version')}; this program reads {FORMAT_VERSION}: open it with the release that wrote it"
+                f"{place}: format version {values.get('format_version')}; this program reads {FORMAT_VERSION}: "
+                "open it with the release that wrote it"
             )
         return cls(**values)
 
@@ -173,10 +174,8 @@ def read_sub_min(group: zarr.Group, images: NDArray[np.int32] | None = None) -> 
 
 def network_images(columns: dict[str, NDArray[Any]]) -> list[NetworkImage]:
     """Images from columns of the image table."""
+    names = ("image_id", "block_id", "pass_id", "sensor", "camera", "width", "height", "seconds", "a_priori", "released")
     return [
         NetworkImage(str(i), str(b), str(p), str(s), str(c), int(w), int(h), float(t), str(a), bool(r))
-        for i, b, p, s, c, w, h, t, a, r in zip(
-            *(columns[k] for k in ("image_id", "block_id", "pass_id", "sensor", "camera", "width", "height", "seconds", "a_priori", "released")),
-            strict=True,
-        )
-    ]  # fmt: skip
+        for i, b, p, s, c, w, h, t, a, r in zip(*(columns[name] for name in names), strict=True)
+    ]

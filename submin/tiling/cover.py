@@ -1,6 +1,7 @@
 """Cover of an area by overlapping tiles, and the cells that their outlines cut.
 
-The area is laid out in metres in a Lambert azimuthal equal-area frame about its middle. *Cores* of one size tile the whole plane: those on the rim of
+The area is laid out in metres in a Lambert azimuthal equal-area frame about its middle. *Cores* of one size tile the whole plane: those
+on the rim of
 the grid reach to infinity, so every position has exactly one owner. A tile is its core, widened on each side by half the overlap. The
 outlines cut the plane into *cells*: all positions with the same owner and the same set of tiles that hold them. With an overlap below the
 core's side a core has nine: its interior, four edges, four corners (docs/mathematics.md, "Cells").
@@ -67,7 +68,8 @@ class Cover:
             raise InputError(f"the side of a core is {self.core} m; expected a positive length (--tile-km)")
         if not 0.0 <= self.overlap < self.core:
             raise InputError(
-                f"the overlap is {self.overlap:g} m; expected 0 or more and less than the core's {self.core:g} m (--overlap-km below --tile-km)"
+                f"the overlap is {self.overlap:g} m; expected 0 or more and less than the core's {self.core:g} m "
+                "(--overlap-km below --tile-km)"
             )
         if self.rows < 1 or self.columns < 1:
             raise InputError(f"the area has {self.rows} x {self.columns} tiles; expected at least one")

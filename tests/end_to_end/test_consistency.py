@@ -1,8 +1,9 @@
 """Simulated regions through the whole product: is the reported accuracy the true one, and are blunders and bad cameras found?
 
-On a small region the errors of a hundred points are few independent numbers: with 10 px of a priori sigma, half of it common to a pass, all points move
-together, and 20 seeds leave "per cent within CE90" a standard deviation of 6. The percentages are therefore judged on cameras known to half a pixel,
-where neighbouring points err separately; NEES, which weighs every direction alike, is judged on both.
+On a small region the errors of a hundred points are few independent numbers: with 10 px of a priori sigma, half of it common to a pass,
+all points move
+together, and 20 seeds leave "per cent within CE90" a standard deviation of 6. The percentages are therefore judged on cameras known to
+half a pixel, where neighbouring points err separately; NEES, which weighs every direction alike, is judged on both.
 """
 
 from __future__ import annotations

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import submin
 from networks import SMALL, accepted_rays, area_of, fuse
+
+import submin
 from orchestration.executors import executor_for
 from submin.simulation.region import SimulatedRegion, simulate_region
 from submin.storage.catalogue import Catalogue
@@ -55,9 +56,16 @@ def by_image(block: Block) -> list[Block]:
         rows = block.image == k
         parts.append(
             Block(
-                image.image_id, (dataclasses.replace(image, block_id=image.image_id),), block.a_priori, block.point_ids[rows],
-                np.zeros(rows.sum(), dtype=np.int32), block.sample[rows], block.line[rows], block.sigma_sample[rows], block.sigma_line[rows],
-            )  # fmt: skip
+                image.image_id,
+                (dataclasses.replace(image, block_id=image.image_id),),
+                block.a_priori,
+                block.point_ids[rows],
+                np.zeros(rows.sum(), dtype=np.int32),
+                block.sample[rows],
+                block.line[rows],
+                block.sigma_sample[rows],
+                block.sigma_line[rows],
+            )
         )
     return parts
 

@@ -4,9 +4,10 @@ All accepted rays of a network, whitened and linearised where the network keeps 
 
     y = A K u + B (x - x0) + v        0 = u + w        Cov v = I,  Cov w = I,  v and w independent,
 
-and every policy's estimate is a linear map of the data ``(y, 0)``. The error of the estimate is the same map of ``(v, w)``, so with F the rows of the map
-that belong to the points asked for, ``P_true = F F'``. Maps have 2 r + q columns: sample and line of each of r rays, then the q whitened image
-parameters' a priori values.
+and every policy's estimate is a linear map of the data ``(y, 0)``. The error of the estimate is the same map of ``(v, w)``, so with F the
+rows of the map
+that belong to the points asked for, ``P_true = F F'``. Maps have 2 r + q columns: sample and line of each of r rays, then the q whitened
+image parameters' a priori values.
 """
 
 from __future__ import annotations

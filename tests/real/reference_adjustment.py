@@ -1,11 +1,13 @@
 """One simultaneous adjustment of all images and all ground points, by plain numpy and scipy: what a network must equal.
 
-The unknowns are the coordinates of all ground points about fixed origins, ``x - x0`` (n, 3), metres, and the *total* corrections ``theta`` (m, 6) of all
-images, pixels. The observations are the accepted rays and ``0 = theta + e`` with a dense a priori covariance Q. All of them, divided by their standard
-deviations, are the rows of one sparse design matrix J; its normal matrix J'J is factored whole by a general sparse solver, and every solution is refined
-with residuals formed from J itself. Nothing is eliminated by hand, there are no vectors of passes, no cells and no tiles.
+The unknowns are the coordinates of all ground points about fixed origins, ``x - x0`` (n, 3), metres, and the *total* corrections
+``theta`` (m, 6) of all images, pixels. The observations are the accepted rays and ``0 = theta + e`` with a dense a priori covariance Q.
+All of them, divided by their standard deviations, are the rows of one sparse design matrix J; its normal matrix J'J is factored whole by
+a general sparse solver, and every solution is refined with residuals formed from J itself. Nothing is eliminated by hand; there are no
+vectors of passes, no cells, no tiles.
 
-From the product come the camera model (tested against GDAL by itself), and what is stored: rays, decisions, linearisation, descriptions of images.
+From the product come the camera model (tested against GDAL by itself), and what is stored: rays, decisions, linearisation, descriptions of
+images.
 """
 
 from __future__ import annotations
@@ -112,8 +114,9 @@ class Solution:
 def prior_covariance(images: Sequence[tuple[str, bool, str]]) -> Array:
     """A priori covariance Q (6 m, 6 m), pixels squared, of the total corrections of m images.
 
-    Each image is given by its pass, whether it is released, and the JSON text of its a priori model, by which images of a block are not correlated. An image's
-    own part has the drifts and what is left of the shifts' variance; its pass has the rest, the same for all its images, released ones too.
+    Each image is given by its pass, whether it is released, and the JSON text of its a priori model, by which images of a block are not
+    correlated. An image's own part has the drifts and what is left of the shifts' variance; its pass has the rest, the same for all its
+    images, released ones too.
     """
     covariance = np.zeros((P * len(images), P * len(images)))
     for i, (pass_i, released, text) in enumerate(images):
@@ -132,7 +135,8 @@ def stored_observations(snapshot: Snapshot, unreleased: frozenset[str] = frozens
     """What a network of RPC images has accepted, each ray at the linearisation that its cell keeps.
 
     A point with one accepted ray has fewer observations than coordinates: it has no place and says nothing about images; it is left out.
-    Images in ``unreleased`` are taken at their first a priori model whatever the network says: a wrong reference, to see that a comparison can fail.
+    Images in ``unreleased`` are taken at their first a priori model whatever the network says: a wrong reference, to see that a comparison
+    can fail.
     """
     images, sensor = snapshot.images(), sensor_named("rpc")
     assert {image.sensor for image in images} == {"rpc"}
@@ -184,19 +188,20 @@ def adjust_linearised(observations: Observations) -> Solution:
     design = sp.vstack([measured, believed], format="csr")
     right = np.concatenate([(y / o.sigma).ravel(), np.zeros(P * m)])
 
-    # points come first and touch no other point, so the order given is already the one with least fill; J'J is positive definite: no pivoting
+    # points come first and touch no other point, so the order given is the one with least fill; J'J is positive definite: no pivoting
     factor = splu((design.T @ design).tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     unknowns = factor.solve(design.T @ right)
     for _ in range(REFINEMENTS):
         unknowns += factor.solve(design.T @ (right - design @ unknowns))
     residual = (right - design @ unknowns)[: 2 * rays] * o.sigma.ravel()
     return Solution(
-        o.point_ids, o.origin, unknowns[: 3 * n].reshape(n, 3), unknowns[3 * n :].reshape(m, P), float(np.sqrt(np.mean(residual**2))), design, factor
+        o.point_ids, o.origin, unknowns[: 3 * n].reshape(n, 3), unknowns[3 * n :].reshape(m, P), float(np.sqrt(np.mean(residual**2))),
+        design, factor,
     )  # fmt: skip
 
 
 def adjust(observations: Observations, iterations: int = 20) -> Solution:
-    """The nonlinear least-squares solution of the same rays: from unadjusted cameras and the origins, linearised anew until nothing moves."""
+    """The nonlinear least-squares solution of the same rays: from unadjusted cameras and the origins, linearised anew until none moves."""
     m = len(observations.image_ids)
     theta, ground = np.zeros((m, P)), observations.origin
     for _ in range(iterations):

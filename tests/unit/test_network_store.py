@@ -1,0 +1,348 @@
+"""The store of a network: what is created, written and read back, version by version, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import icechunk
+import numpy as np
+import pytest
+import zarr
+from numpy.typing import NDArray
+from shapely.geometry import box
+
+import submin
+from submin.adjustment.elimination import Sums
+from submin.adjustment.rays import Rays
+from submin.errors import ConflictError, QueryError, StoreError
+from submin.geodesy import Ellipsoid
+from submin.network.cell import Cell
+from submin.network.sub_min import SubMin
+from submin.storage.arrays import append_table, group_of, hash_ids
+from submin.storage.network_store import Snapshot, commit, create_network, versions, writable_session
+from submin.storage.schema import (
+    FORMAT_VERSION,
+    IMAGE_COLUMNS,
+    LEDGER_COLUMNS,
+    NetworkMetadata,
+    pack_lower,
+    unpack_lower,
+    write_cell,
+    write_sub_min,
+)
+from submin.tiling.cover import cover_area
+
+Array = NDArray[np.float64]
+
+COVER = cover_area(box(5.0, 43.0, 5.5, 43.4), 20e3, 4e3)
+METADATA = NetworkMetadata("provence", "Earth", "ITRF2014", "2010.0", 6378137.0, 1.0 / 298.257223563, COVER.to_mapping())
+
+
+def new(tmp_path: Path) -> str:
+    place = str(tmp_path / "network")
+    create_network(place, METADATA)
+    return place
+
+
+def write(place: str, version: int, change: Any) -> None:
+    """Commit one version: ``change`` gets the root."""
+    session = writable_session(place)
+    root = zarr.open_group(session.store, mode="r+")
+    change(root)
+    root.attrs["version"] = version
+    commit(session, version, f"batch {version}")
+
+
+def random_cell(number: int, seed: int = 1, points: int = 5) -> Cell:
+    rng = np.random.default_rng(seed)
+    images = np.sort(rng.choice(50, 4, replace=False)).astype(np.int32)
+    point = np.repeat(np.arange(points, dtype=np.int32), 3)
+    rays = Rays(
+        point, rng.integers(0, 4, len(point)).astype(np.int32), rng.normal(5e3, 1e3, (len(point), 2)),
+        rng.uniform(0.3, 1.0, (len(point), 2)), rng.uniform(size=len(point)) < 0.7,
+    )  # fmt: skip
+    return Cell(
+        number, np.array([f"SET/点{i}" for i in range(points)]), rng.normal(0.0, 4e6, (points, 3)), rng.normal(0.0, 4e6, (points, 3)),
+        rng.uniform(size=points) < 0.5, images, rng.normal(size=(4, 6)), rays,
+        Sums(np.tril(rng.normal(size=(24, 24))), rng.normal(size=24), 12.5, 17),
+    )  # fmt: skip
+
+
+def assert_same_cell(found: Cell, expected: Cell) -> None:
+    assert found.number == expected.number
+    for name in ("point_ids", "origin", "linearised_at", "final", "images", "theta"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    for name in ("point", "image", "observed", "sigma", "accepted"):
+        np.testing.assert_array_equal(getattr(found.rays, name), getattr(expected.rays, name))
+        assert getattr(found.rays, name).dtype == getattr(expected.rays, name).dtype
+    assert found.final.dtype == expected.final.dtype and found.images.dtype == expected.images.dtype
+
+
+def image_columns(count: int, first: int = 0) -> dict[str, NDArray[Any]]:
+    kinds: dict[str, NDArray[Any]] = {}
+    for name, kind in IMAGE_COLUMNS.items():
+        if kind == "text":
+            kinds[name] = np.array([f"{name} {first + k}" for k in range(count)])
+        else:
+            kinds[name] = np.arange(first, first + count).astype(kind)
+    return kinds | {"licence": np.full(count, ""), "released": (np.arange(first, first + count) % 2).astype(np.uint8)}
+
+
+# Creating and opening
+
+
+def test_new_network_is_version_zero_and_empty(tmp_path: Path) -> None:
+    place = str(tmp_path / "network")
+    version = create_network(place, METADATA)
+    assert (version.name, version.message) == ("v0", "created")
+    snapshot = Snapshot.open(place)
+    assert snapshot.version == "v0"
+    assert snapshot.metadata == METADATA
+    assert snapshot.cover == COVER
+    assert (snapshot.cell_numbers(), snapshot.tile_numbers(), snapshot.image_count(), snapshot.flags()) == ((), (), 0, set())
+    assert snapshot.images() == [] and len(snapshot.ledger()["block_id"]) == 0
+    assert len(snapshot.cell(7)) == 0 and snapshot.cell(7).number == 7
+    np.testing.assert_array_equal(snapshot.candidate_cells(np.array(["a", "b"])), [-1, -1])
+    assert len(snapshot.candidate_cells(np.empty(0, dtype="U1"))) == 0
+
+
+def test_metadata_come_back_with_their_body(tmp_path: Path) -> None:
+    moon = replace(METADATA, body="Moon", semimajor_axis=1737400.0, flattening=0.0)
+    create_network(str(tmp_path / "moon"), moon)
+    assert Snapshot.open(str(tmp_path / "moon")).metadata.ellipsoid == Ellipsoid(1737400.0, 0.0)
+
+
+def test_empty_folder_will_do(tmp_path: Path) -> None:
+    (tmp_path / "network").mkdir()
+    assert create_network(str(tmp_path / "network"), METADATA).number == 0
+
+
+def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    with pytest.raises(StoreError, match="network: already exists; choose another place"):
+        create_network(place, METADATA)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(StoreError, match="file: already exists"):
+        create_network(str(tmp_path / "file"), METADATA)
+    assert (tmp_path / "file").read_text() == "mine"
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "letter").write_text("mine")
+    with pytest.raises(StoreError, match="folder: already exists"):
+        create_network(str(tmp_path / "folder"), METADATA)
+    assert [p.name for p in (tmp_path / "folder").iterdir()] == ["letter"]
+    assert Snapshot.open(place).version == "v0"
+
+
+def test_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(StoreError, match="network: "):
+        create_network(str(tmp_path / "file" / "network"), METADATA)
+
+
+def test_what_is_not_a_network_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="nowhere: no such network; make one with 'submin create'"):
+        Snapshot.open(str(tmp_path / "nowhere"))
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(StoreError, match="file: no such network"):
+        Snapshot.open(str(tmp_path / "file"))
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "letter").write_text("mine")
+    for opening in (Snapshot.open, submin.open, versions):
+        with pytest.raises(StoreError, match="folder: not a network .*; make one with 'submin create'"):
+            opening(str(tmp_path / "folder"))
+
+
+def test_repository_of_something_else_is_refused(tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    icechunk.Repository.create(icechunk.local_filesystem_storage(str(empty)))
+    with pytest.raises(StoreError, match="empty: holds a repository but no network"):
+        Snapshot.open(str(empty))
+    other = tmp_path / "other"
+    session = icechunk.Repository.create(icechunk.local_filesystem_storage(str(other))).writable_session("main")
+    zarr.create_group(session.store, attributes={"title": "temperatures"})
+    session.commit("a data cube")
+    with pytest.raises(StoreError, match="other: not a network .its root has no 'submin' attributes"):
+        Snapshot.open(str(other))
+
+
+@pytest.mark.parametrize("format_version", [FORMAT_VERSION + 1, 0, None])
+def test_other_format_versions_are_refused(tmp_path: Path, format_version: int | None) -> None:
+    place = new(tmp_path)
+
+    def change(root: zarr.Group) -> None:
+        root.attrs["submin"] = METADATA.to_attributes()["submin"] | {"format_version": format_version}
+
+    write(place, 1, change)
+    with pytest.raises(StoreError, match=f"format version {format_version}; this program reads {FORMAT_VERSION}"):
+        Snapshot.open(place)
+    assert Snapshot.open(place, "v0").version == "v0"
+
+
+# Versions
+
+
+def test_versions_are_listed_the_newest_first_and_each_can_be_opened(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    for number in (1, 2):
+        write(place, number, lambda root, number=number: append_table(group_of(root, "images"), image_columns(3, 3 * number)))
+    listed = versions(place)
+    assert [v.name for v in listed] == ["v2", "v1", "v0"]
+    assert [v.message for v in listed] == ["batch 2", "batch 1", "created"]
+    assert listed[0].written > listed[1].written > listed[2].written
+    assert [Snapshot.open(place, v.name).image_count() for v in listed] == [6, 3, 0]
+    assert Snapshot.open(place).version == "v2"
+
+
+def test_reader_keeps_its_version_while_another_is_written(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    before = Snapshot.open(place)
+    write(place, 1, lambda root: append_table(group_of(root, "images"), image_columns(3)))
+    assert (before.version, before.image_count()) == ("v0", 0)
+    network = submin.open(place)
+    assert network.version == "v1"
+    assert network.at("v0").version == "v0"
+    assert network.at("v0").at("v1").version == "v1"
+
+
+@pytest.mark.parametrize("version", ["v2", "2", "newest", "v-1", ""])
+def test_unknown_version_is_named_with_those_there_are(tmp_path: Path, version: str) -> None:
+    place = new(tmp_path)
+    write(place, 1, lambda root: None)
+    with pytest.raises(QueryError, match=f"version is '{version}'; expected one of v0 to v1"):
+        Snapshot.open(place, version)
+    with pytest.raises(QueryError, match="expected one of v0 to v1"):
+        submin.open(place).at(version)
+
+
+def test_of_two_writers_one_is_turned_away_and_leaves_nothing(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    sessions = [writable_session(place) for _ in range(2)]
+    for k, session in enumerate(sessions):
+        root = zarr.open_group(session.store, mode="r+")
+        append_table(group_of(root, "images"), image_columns(k + 1))
+        root.attrs["version"] = 1
+    commit(sessions[0], 1, "first")
+    with pytest.raises(ConflictError, match="another run committed to this network meanwhile; nothing of this batch was written"):
+        commit(sessions[1], 1, "second")
+    assert [v.message for v in versions(place)] == ["first", "created"]
+    assert Snapshot.open(place).image_count() == 1
+
+
+# Content
+
+
+def test_cell_comes_back(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    number = COVER.cells_owned(1)[2]
+    cell = random_cell(number)
+    write(place, 1, lambda root: write_cell(root, COVER.cell_name(number), cell, 3.5))
+    snapshot = Snapshot.open(place)
+    assert snapshot.cell_numbers() == (number,)
+    found = snapshot.cell(number)
+    assert_same_cell(found, cell)
+    np.testing.assert_array_equal(found.sums.information, cell.sums.information)
+    np.testing.assert_array_equal(found.sums.vector, cell.sums.vector)
+    assert (found.sums.misclosure, found.sums.redundancy) == (12.5, 17)
+    without = snapshot.cell(number, with_sums=False)
+    assert_same_cell(without, cell)
+    assert without.sums.information.size == 0
+    attributes = snapshot.cell_attributes(number)
+    accepted = [int(cell.rays.accepted[cell.rays.point == j].sum()) for j in range(len(cell))]
+    assert (attributes["points"], attributes["rays"], attributes["accepted"]) == (5, 15, sum(accepted))
+    assert (attributes["determined"], attributes["square_px"]) == (sum(count >= 2 for count in accepted), 3.5)
+    network = submin.open(place)
+    images, sums = network.cell_sums(number)
+    np.testing.assert_array_equal(images, cell.images)
+    np.testing.assert_array_equal(sums.information, cell.sums.information)
+
+
+def test_cell_is_replaced_whole_and_its_past_stays(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    name = COVER.cell_name(4)
+    old, later = random_cell(4, seed=1, points=6), random_cell(4, seed=2, points=2)
+    write(place, 1, lambda root: write_cell(root, name, old, 0.0))
+    write(place, 2, lambda root: write_cell(root, name, later, 0.0))
+    assert_same_cell(Snapshot.open(place).cell(4), later)
+    assert_same_cell(Snapshot.open(place, "v1").cell(4), old)
+
+
+def sub_min(images: int, seed: int = 1) -> SubMin:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(6 * images, 6 * images))
+    rows = np.sort(rng.choice(10 * images, images, replace=False)).astype(np.int32)
+    return SubMin(rows, rng.normal(size=(images, 6)), root @ root.T, 101.5, 99)
+
+
+@pytest.mark.parametrize("images", [1, 5, 60])
+def test_sub_min_comes_back_and_so_do_its_marginals(tmp_path: Path, images: int) -> None:
+    # 60 images are 360 parameters: more than one chunk of 256
+    place, expected = new(tmp_path), sub_min(images)
+    write(place, 1, lambda root: write_sub_min(root, COVER.tile_name(2), expected, [4, 9]))
+    snapshot = Snapshot.open(place)
+    assert snapshot.tile_numbers() == (2,)
+    np.testing.assert_array_equal(snapshot.tile_images(2), expected.images)
+    found = snapshot.sub_min(2)
+    np.testing.assert_array_equal(found.images, expected.images)
+    np.testing.assert_array_equal(found.theta, expected.theta)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    assert (found.chi_square, found.redundancy) == (101.5, 99)
+    some = np.union1d(expected.images[::3], [2**20]).astype(np.int32)
+    marginal = snapshot.sub_min(2, some)
+    at = np.flatnonzero(np.isin(expected.images, some))
+    rows = (6 * at[:, None] + np.arange(6)).ravel()
+    np.testing.assert_array_equal(marginal.images, expected.images[at])
+    np.testing.assert_array_equal(marginal.theta, expected.theta[at])
+    np.testing.assert_array_equal(marginal.covariance, expected.covariance[np.ix_(rows, rows)])
+
+
+def test_tile_without_sub_min_is_named(tmp_path: Path) -> None:
+    with pytest.raises(QueryError, match=f"tile {COVER.tile_name(3)} holds nothing yet"):
+        submin.open(new(tmp_path)).sub_min(3, None)
+
+
+def test_images_come_back_by_row(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    write(place, 1, lambda root: append_table(group_of(root, "images"), image_columns(4)))
+    write(place, 2, lambda root: append_table(group_of(root, "images"), image_columns(5, 4)))
+    snapshot = Snapshot.open(place)
+    every = snapshot.images()
+    assert [i.image_id for i in every] == [f"image_id {k}" for k in range(9)]
+    assert (every[7].camera, every[7].width, every[7].height, every[7].seconds) == ("camera 7", 7, 7, 7.0)
+    assert [i.released for i in every] == [k % 2 == 1 for k in range(9)]
+    assert snapshot.images([2, 3, 8]) == [every[2], every[3], every[8]]
+    assert snapshot.images(np.array([5], dtype=np.int32)) == [every[5]]
+    assert snapshot.images([]) == []
+    assert snapshot.image_columns(["block_id"])["block_id"].tolist() == [f"block_id {k}" for k in range(9)]
+
+
+def test_directory_finds_the_last_cell_of_a_point(tmp_path: Path) -> None:
+    place = new(tmp_path)
+
+    def enter(root: zarr.Group, points: list[str], cells: list[int]) -> None:
+        append_table(group_of(root, "directory"), {"hash": hash_ids(np.array(points)), "cell": np.array(cells)})
+
+    write(place, 1, lambda root: enter(root, ["a", "b", "点", "moved"], [1, 2, 3, 4]))
+    write(place, 2, lambda root: enter(root, ["moved", "c", "moved"], [40, 5, 44]))
+    wanted = np.array(["moved", "none", "点", "a", "moved", "c"])
+    np.testing.assert_array_equal(Snapshot.open(place).candidate_cells(wanted), [44, -1, 3, 1, 44, 5])
+    np.testing.assert_array_equal(Snapshot.open(place, "v1").candidate_cells(wanted), [4, -1, 3, 1, 4, -1])
+
+
+def test_ledger_comes_back(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    content: dict[str, NDArray[Any]] = {
+        name: np.array(["fused", "rejected"]) if kind == "text" else np.array([3, 4]) for name, kind in LEDGER_COLUMNS.items()
+    }
+    write(place, 1, lambda root: append_table(group_of(root, "ledger"), content))
+    found = Snapshot.open(place).ledger(["status", "rays"])
+    assert {name: values.tolist() for name, values in found.items()} == {"status": ["fused", "rejected"], "rays": [3, 4]}
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 3, 50, 600])
+def test_packed_triangle_comes_back(size: int) -> None:
+    lower = np.tril(np.random.default_rng(size).normal(size=(size, size)))
+    packed = pack_lower(lower)
+    assert packed.shape == (size * (size + 1) // 2,)
+    np.testing.assert_array_equal(unpack_lower(packed), lower)
