@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
+from submin.adjustment.warm_up import compile_kernels
 from submin.errors import InputError
 
 Advance = Callable[[], None]
@@ -134,6 +135,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         with client:
             yield DaskExecutor(client)
         return
+    compile_kernels()
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     with (
         # set before the workers load numpy

@@ -1,0 +1,33 @@
+"""Compile the kernels once, in one process, so that workers started afterwards find them in the cache instead of each compiling their own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from submin.adjustment.adjustment import adjust
+from submin.adjustment.images import ImageSet
+from submin.adjustment.intersection import intersect
+from submin.adjustment.priors import APriori, ImagePrior
+from submin.adjustment.rays import sorted_rays
+from submin.sensors import sensor_named
+
+
+def compile_kernels() -> None:
+    """Adjust two points in two images, which goes through every kernel; a second when they are in the cache already."""
+    linear, one = np.zeros(20), np.zeros(20)
+    one[0] = 1.0
+    cameras = []
+    for tilt in (-0.5, 0.5):
+        camera = dict.fromkeys(("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF"), 0.0)
+        camera |= dict.fromkeys(("LINE_SCALE", "SAMP_SCALE", "HEIGHT_SCALE"), 1000.0) | dict.fromkeys(("LAT_SCALE", "LONG_SCALE"), 0.01)
+        samples, lines = linear.copy(), linear.copy()
+        samples[1], lines[2], lines[3] = 1.0, 1.0, tilt
+        polynomials = {"SAMP_NUM_COEFF": samples, "SAMP_DEN_COEFF": one, "LINE_NUM_COEFF": lines, "LINE_DEN_COEFF": one}
+        cameras.append(sensor_named("rpc").pack(camera | polynomials, 2000, 2000))
+    priors = tuple(ImagePrior("warm", "up", float("nan"), APriori(), (0, 3)) for _ in cameras)
+    images = ImageSet(("a", "b"), ("rpc", "rpc"), np.array(cameras), priors)
+    index = np.array([0, 0, 1, 1], dtype=np.int32)
+    observed = np.array([[10.0, 20.0], [10.5, 20.0], [90.0, 70.0], [90.0, 71.0]])
+    image = np.array([0, 1, 0, 1], dtype=np.int32)
+    rays = sorted_rays(index, image, observed, np.full((4, 2), 0.5), np.ones(4, dtype=np.bool_))
+    adjust(images, rays, intersect(images, rays, 2).geocentric)
