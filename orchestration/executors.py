@@ -129,7 +129,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
 
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout="20s")
+            client = Client(scheduler, timeout="10s")
         except (OSError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {scheduler!r} ({error}); start one with 'dask scheduler'") from None
         with client:

@@ -1,4 +1,4 @@
-"""Compile the kernels once, in one process, so that workers started afterwards find them in the cache instead of each compiling their own."""
+"""Compile the kernels in one process before workers start, so that they find them in the cache instead of each compiling their own."""
 
 from __future__ import annotations
 

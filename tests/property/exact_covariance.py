@@ -172,22 +172,29 @@ def intersected(problem: Equations, tiles: Sequence[int], weights: Array) -> Arr
 
 
 def weighted_sum(parts: Sequence[Information], weights: Sequence[float] | Array) -> Array:
-    """Map to the images from weighted information of several estimates; all weights 1 is the naive independent merge."""
+    """Map to the images from weighted information of several estimates; with every weight 1 the naive independent merge."""
     whole = sum(weight * part.root.T @ part.root for part, weight in zip(parts, weights, strict=True))
     right = sum(weight * part.root.T @ part.map for part, weight in zip(parts, weights, strict=True))
     return np.asarray(la.solve(whole, right, assume_a="pos"))
 
 
-def located(problem: Equations, images: Array, ids: NDArray[np.str_]) -> Array:
-    """Map (3 n, 2 r + q) to ground points, each the best fit of its own rays to the images' estimate."""
+def fitted(problem: Equations, ids: NDArray[np.str_]) -> tuple[Array, Array]:
+    """Ground points as the best fit of their own rays, given the images: maps (3 n, 2 r + q) of the data and (3 n, q) of the images."""
     points = np.isin(problem.point_ids, ids)
     assert points.sum() == len(ids)
     by_ground = problem.by_ground[:, np.repeat(points, 3)]
     rows = np.flatnonzero(by_ground.any(axis=1))
     orthogonal, triangle = la.qr(by_ground[rows], mode="economic")
-    residual = -problem.by_images[rows] @ images
-    residual[np.arange(len(rows)), rows] += 1.0
-    return np.asarray(la.solve_triangular(triangle, orthogonal.T @ residual))
+    inverse = la.solve_triangular(triangle, orthogonal.T)
+    own = np.zeros((len(inverse), len(problem.data)))
+    own[:, rows] = inverse
+    return own, -inverse @ problem.by_images[rows]
+
+
+def located(problem: Equations, images: Array, ids: NDArray[np.str_]) -> Array:
+    """Map (3 n, 2 r + q) to ground points, given the map (q, 2 r + q) to the images' estimate."""
+    own, loading = fitted(problem, ids)
+    return own + loading @ images
 
 
 def monolithic(problem: Equations) -> tuple[Array, Array]:

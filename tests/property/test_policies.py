@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from property.exact_covariance import (
     Equations,
     adjusted_together,
     equations,
+    fitted,
     information,
     intersected,
     largest_ratio,
@@ -52,13 +54,13 @@ class Case:
 
 
 CASES = {
-    "overlap": Case(replace(CLEAN, seed=5, priors=APriori(correlation="exponential", correlation_parameter=20.0)), 40.0, 20.0),
+    "overlap": Case(replace(CLEAN, seed=5, priors=APriori(correlation="exponential", correlation_parameter=20.0)), 60.0, 20.0),
     "no overlap": Case(replace(CLEAN, seed=8), 40.0, 0.0, batch_blocks=5),
-    "released camera": Case(replace(CLEAN, seed=1, bad_cameras=1), 60.0, 30.0),
+    "released camera": Case(replace(CLEAN, seed=1, bad_cameras=1), 60.0, 20.0),
 }
 
 ONE_TILE = ("one cell", "overlap of two", "overlap of four")
-SEVERAL_TILES = ("one cell", "overlap of two", "overlap of four", "border", "corner", "everything")
+SEVERAL_TILES = (*ONE_TILE, "border", "corner")
 
 
 @dataclass(frozen=True)
@@ -87,14 +89,19 @@ class Made:
     places: dict[str, Ids]
 
 
-@pytest.fixture(scope="module", params=CASES)
-def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return make(CASES[request.param], tmp_path_factory.mktemp("policies"))
-
-
 @pytest.fixture(scope="module")
-def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return make(Case(replace(CLEAN, seed=3), 60.0, 20.0), tmp_path_factory.mktemp("overlapping"))
+def networks(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Made]:
+    return cache(lambda name: make(CASES[name], tmp_path_factory.mktemp("policies")))
+
+
+@pytest.fixture(scope="module", params=CASES)
+def made(request: pytest.FixtureRequest, networks: Callable[[str], Made]) -> Made:
+    return networks(request.param)
+
+
+@pytest.fixture
+def overlapping(networks: Callable[[str], Made]) -> Made:
+    return networks("overlap")
 
 
 def make(case: Case, folder: Path) -> Made:
@@ -116,7 +123,7 @@ def places(problem: Equations) -> dict[str, Ids]:
     """Points of the most populous single cell, overlaps, border of two cores and corner of four; overlaps only where there are any."""
     cover, cell = problem.cover, problem.point_cell
     held_by = np.array([len(cover.holders(c)) for c in cell])
-    found = {"everything": np.ones(len(cell), dtype=bool)}
+    found = {}
     for name, holders in (("one cell", 1), ("overlap of two", 2), ("overlap of four", 4)):
         if (held_by == holders).any():
             found[name] = cell == np.bincount(cell[held_by == holders]).argmax()
@@ -166,10 +173,10 @@ def test_the_answer_is_consistent(made: Made, policy: str, place: str, monkeypat
         assert largest_ratio(control.covariance, true) <= CONSISTENT
 
 
-def test_every_tile_alone_is_consistent(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
-    tiles = made.network.snapshot.tile_numbers()
-    assert len(tiles) >= 9
-    for tile in tiles:
+def test_a_tile_alone_is_consistent_for_all_its_points(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert made.network.cover.rows >= 3
+    assert made.network.cover.columns >= 3
+    for tile in range(made.network.cover.columns + 2):  # corner, rim and inside
         control, weights = asked(made, "tile", monkeypatch, tile=made.network.cover.tile_name(tile))
         positions, true = exact(made, control, weights)
         np.testing.assert_array_equal(control.ids, made.problem.point_ids[np.isin(made.problem.point_cell, made.problem.held([tile]))])
@@ -198,23 +205,19 @@ def test_a_naive_independent_merge_is_not_consistent(overlapping: Made, merge: s
     ids = [problem.point_ids[np.isin(problem.point_cell, held[tile])] for tile in pair]
     union = np.union1d(*ids)
     if merge == "images":
-        images = weighted_sum(of_tiles, [1.0, 1.0])
+        own, loading = fitted(problem, union)
+        linear_map = own + loading @ weighted_sum(of_tiles, [1.0, 1.0])
         believed = np.linalg.inv(sum(part.root.T @ part.root for part in of_tiles))
-        linear_map = located(problem, images, union)
-        # the map's own part, and the images' as if their covariance were the one believed
-        loading = located(problem, np.zeros_like(images), union) - linear_map
-        loading = loading @ np.linalg.pinv(images)
-        own = located(problem, np.zeros_like(images), union)
         reported = own @ own.T + loading @ believed @ loading.T
     else:
         total = np.zeros((3 * len(union), 3 * len(union)))
         right = np.zeros((3 * len(union), len(problem.data)))
         for part, of_tile in zip(of_tiles, ids, strict=True):
-            linear_map = located(problem, np.linalg.solve(part.root, part.map), of_tile)
-            weight = np.linalg.inv(linear_map @ linear_map.T)
+            alone = located(problem, np.linalg.solve(part.root, part.map), of_tile)
+            weight = np.linalg.inv(alone @ alone.T)
             at = np.flatnonzero(np.repeat(np.isin(union, of_tile), 3))
             total[np.ix_(at, at)] += weight
-            right[at] += weight @ linear_map
+            right[at] += weight @ alone
         reported = np.linalg.inv(total)
         linear_map = reported @ right
     ratio = largest_ratio(linear_map @ linear_map.T, reported)

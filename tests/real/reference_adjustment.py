@@ -111,6 +111,12 @@ class Solution:
         return joint
 
 
+def largest_difference(found: Array, expected: Array) -> float:
+    """Largest ``|P_ij - Q_ij| / sqrt(Q_ii Q_jj)`` of a covariance P and the expected Q."""
+    sigma = np.sqrt(np.diag(expected))
+    return float(np.abs((found - expected) / np.outer(sigma, sigma)).max())
+
+
 def prior_covariance(images: Sequence[tuple[str, bool, str]]) -> Array:
     """A priori covariance Q (6 m, 6 m), pixels squared, of the total corrections of m images.
 
@@ -131,10 +137,13 @@ def prior_covariance(images: Sequence[tuple[str, bool, str]]) -> Array:
     return covariance
 
 
-def stored_observations(snapshot: Snapshot, unreleased: frozenset[str] = frozenset()) -> Observations:
+def stored_observations(
+    snapshot: Snapshot, *, every_ray: bool = False, unreleased: frozenset[str] = frozenset()
+) -> Observations:
     """What a network of RPC images has accepted, each ray at the linearisation that its cell keeps.
 
     A point with one accepted ray has fewer observations than coordinates: it has no place and says nothing about images; it is left out.
+    With ``every_ray`` the rejected rays are there too, as they are before any judgement.
     Images in ``unreleased`` are taken at their first a priori model whatever the network says: a wrong reference, to see that a comparison
     can fail.
     """
@@ -144,7 +153,8 @@ def stored_observations(snapshot: Snapshot, unreleased: frozenset[str] = frozens
     for number in snapshot.cell_numbers():
         cell = snapshot.cell(number, with_sums=False)
         rays = cell.rays
-        used = rays.accepted & (np.bincount(rays.point[rays.accepted], minlength=len(cell))[rays.point] >= 2)
+        candidates = rays.accepted | every_ray
+        used = candidates & (np.bincount(rays.point[candidates], minlength=len(cell))[rays.point] >= 2)
         at, of_cell = rays.point[used], rays.image[used]
         ids.append(cell.point_ids[at])
         image.append(cell.images[of_cell].astype(np.int64))
@@ -212,3 +222,26 @@ def adjust(observations: Observations, iterations: int = 20) -> Solution:
         if step_px < CONVERGED_PIXELS and step_m < CONVERGED_METRES:
             return solution
     raise AssertionError(f"the reference has not converged: last step {step_px:.1e} px, {step_m:.1e} m")
+
+
+def ray_statistics(observations: Observations, theta: Array) -> Array:
+    """Baarda's test statistic (r,) of each ray, all rays of its point taken together, images held at ``theta`` (m, 6).
+
+    The larger one of the two coordinates; 0 for a coordinate that no other observation of the point checks (less than a hundredth of its
+    variance). Points are brought to the place that suits all their rays first. Images without error make it a little too small.
+    """
+    o, sensor, every = observations, sensor_named("rpc"), np.arange(len(observations.point), dtype=np.int32)
+    ground = o.origin
+    for _ in range(10):
+        projection = sensor.project(o.cameras[o.image], theta[o.image], Ground.at(ground[o.point]), every, every)
+        v = (o.observed - projection.image) / o.sigma
+        b = projection.by_ground / o.sigma[:, :, None]
+        normal, right = np.zeros((len(ground), 3, 3)), np.zeros((len(ground), 3))
+        np.add.at(normal, o.point, np.einsum("rci,rcj->rij", b, b))
+        np.add.at(right, o.point, np.einsum("rci,rc->ri", b, v))
+        inverse = np.linalg.inv(normal)
+        step = np.einsum("nij,nj->ni", inverse, right)
+        ground = ground + step
+    left = v - np.einsum("rci,ri->rc", b, step[o.point])
+    free = 1.0 - np.einsum("rci,rij,rcj->rc", b, inverse[o.point], b)
+    return np.asarray(np.where(free > 0.01, np.abs(left) / np.sqrt(np.maximum(free, 0.01)), 0.0).max(axis=1))

@@ -20,7 +20,7 @@ import pytest
 import shapely
 from networks import accepted_rays, fuse
 from numpy.typing import NDArray
-from real.reference_adjustment import Array, Solution, adjust, adjust_linearised, stored_observations
+from real.reference_adjustment import Array, Solution, adjust, adjust_linearised, largest_difference, stored_observations
 
 import submin
 from orchestration.executors import executor_for
@@ -45,12 +45,6 @@ PARTS = 4
 EQUAL = 1e-9
 SAME_METRES = 1e-4
 SAME_COVARIANCE = 1e-4
-
-
-def relative(found: Array, expected: Array) -> float:
-    """Largest difference of two covariances, relative to the standard deviations of the second."""
-    sigma = np.sqrt(np.diag(expected))
-    return float(np.abs((found - expected) / np.outer(sigma, sigma)).max())
 
 
 @dataclass(frozen=True)
@@ -224,14 +218,14 @@ def test_positions_are_those_of_one_simultaneous_adjustment(networks: Networks, 
 def test_covariance_is_that_of_one_simultaneous_adjustment(networks: Networks, way: str) -> None:
     made = networks[way]
     assert np.array_equal(made.control.ids, made.chosen)
-    assert relative(made.control.covariance, made.linear_covariance) <= EQUAL
+    assert largest_difference(made.control.covariance, made.linear_covariance) <= EQUAL
 
 
 def test_a_wrong_prior_would_be_seen(base: Made) -> None:
     """The comparison can fail: the reference with the bad camera's prior kept is another adjustment."""
     wrong = adjust_linearised(stored_observations(base.network.snapshot, unreleased=frozenset({BAD_CAMERA})))
     few = base.chosen[::20]
-    assert relative(wrong.covariance(few), base.linear.covariance(few)) > 1e-3
+    assert largest_difference(wrong.covariance(few), base.linear.covariance(few)) > 1e-3
     assert np.abs(wrong.correction - base.linear.correction).max() > 1e-3
 
 
@@ -244,7 +238,7 @@ def test_positions_are_those_of_the_nonlinear_adjustment(networks: Networks, way
 @pytest.mark.parametrize("way", WAYS)
 def test_covariance_is_that_of_the_nonlinear_adjustment(networks: Networks, way: str) -> None:
     made = networks[way]
-    assert relative(made.control.covariance, made.nonlinear_covariance) <= SAME_COVARIANCE
+    assert largest_difference(made.control.covariance, made.nonlinear_covariance) <= SAME_COVARIANCE
 
 
 @pytest.mark.parametrize(("one", "other"), list(itertools.combinations(WAYS, 2)))
@@ -260,14 +254,15 @@ def test_the_same_network(networks: Networks, one: str, other: str) -> None:
     first, second = networks[one], networks[other]
     assert np.array_equal(first.linear.point_ids, second.linear.point_ids)
     assert np.abs(first.positions - second.positions).max() <= SAME_METRES
-    assert relative(second.control.covariance, first.control.covariance) <= SAME_COVARIANCE
+    assert largest_difference(second.control.covariance, first.control.covariance) <= SAME_COVARIANCE
 
 
 def test_serial_is_two_workers(networks: Networks) -> None:
-    """The same tasks in other processes: the same numbers, but for what other BLAS threads may add in another order."""
+    """The same tasks in other processes: the same numbers, but for sums that BLAS forms in another order with another number of threads, which
+    the condition of the images' information (1e9, one image being released) makes larger."""
     serial, workers = networks["base"], networks["two workers"]
     assert np.abs(serial.positions - workers.positions).max() <= 2e-9  # two steps of float64 at the Earth's radius
-    assert relative(workers.control.covariance, serial.control.covariance) <= 1e-12
+    assert largest_difference(workers.control.covariance, serial.control.covariance) <= 1e-10
     assert abs(serial.result.ray_rms_px - workers.result.ray_rms_px) <= 1e-12
 
 
