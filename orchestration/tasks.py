@@ -28,7 +28,6 @@ from submin.storage.schema import write_cell, write_sub_min
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-MIN_MEASURED_POINTS = 1
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,6 @@ class ConflictError(StoreError):
     """Another coordinator committed to the network while this one was at work."""
 
 
-class BlockRejected(SubminError):
-    """One block cannot be fused; the others can. The message is the reason kept in the ledger."""
-
-
 class NumericalError(SubminError):
     """A computation without a trustworthy result (a matrix that is not positive definite, no convergence)."""
 

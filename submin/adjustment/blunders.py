@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from submin.adjustment.elimination import Array, Index, LinearRays, Offsets, _gather, _most_rays, _orthonormal
+from submin.adjustment.elimination import Array, Index, LinearRays, Offsets
+from submin.adjustment.point_basis import gather, most_rays, orthonormal, remove_ground
 
 CRITICAL_RAY = 4.0
 """A ray whose w exceeds this is a blunder (1 good coordinate in 16,000; decision 004 says why not 3.29)."""
@@ -31,26 +32,21 @@ def _residuals(
     """Residuals (r, 2) of the accepted rays, in sigmas, and their variances (r, 2) for known theta; NaN for the others."""
     p = by_parameters.shape[2]
     residual, variance = np.full(y.shape, np.nan), np.full(y.shape, np.nan)
-    most = _most_rays(first)
+    most = most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot = np.empty((3, 3)), np.empty(3, np.int32)
     for j in range(len(first) - 1):
-        n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+        n = gather(j, first, weight, by_ground, y, rays, root, b, t)
         if n == 0:
             continue
-        rank = _orthonormal(b, 2 * n, q, r, pivot)
+        rank = orthonormal(b, 2 * n, q, r, pivot)
         for a in range(n):
             i = rays[a]
             for c in range(2):
                 for u in range(p):
                     t[2 * a + c] -= root[a] * by_parameters[i, c, u] * theta[image[i], u]
-        for e in range(rank):
-            dot = 0.0
-            for i in range(2 * n):
-                dot += q[i, e] * t[i]
-            for i in range(2 * n):
-                t[i] -= dot * q[i, e]
+        remove_ground(q, rank, 2 * n, t)
         for a in range(n):
             i = rays[a]
             for c in range(2):
@@ -71,17 +67,17 @@ def _snoop(
     Changes ``weight``; ``statistic`` (r,) becomes each ray's last w.
     """
     p = by_parameters.shape[2]
-    most = _most_rays(first)
+    most = most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
     row = np.empty(most * p)
     for j in range(len(first) - 1):
         while True:
-            n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+            n = gather(j, first, weight, by_ground, y, rays, root, b, t)
             if n < 2:
                 break
-            rank = _orthonormal(b, 2 * n, q, r, pivot)
+            rank = orthonormal(b, 2 * n, q, r, pivot)
             if 2 * n <= rank:
                 break
             for a in range(n):
@@ -92,12 +88,7 @@ def _snoop(
                 for u in range(p):
                     for e in range(rank):
                         z[a, e, u] = q[2 * a, e] * by_parameters[i, 0, u] + q[2 * a + 1, e] * by_parameters[i, 1, u]
-            for e in range(rank):
-                dot = 0.0
-                for i in range(2 * n):
-                    dot += q[i, e] * t[i]
-                for i in range(2 * n):
-                    t[i] -= dot * q[i, e]
+            remove_ground(q, rank, 2 * n, t)
             worst, worst_w = -1, 0.0
             for a in range(n):
                 statistic[rays[a]] = 0.0

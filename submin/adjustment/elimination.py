@@ -22,14 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.images import ImageSet
+from submin.adjustment.point_basis import gather, most_rays, orthonormal, remove_ground
 from submin.adjustment.rays import Rays
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 Offsets = NDArray[np.int64]
-
-ROUND_OFF = 1e-13
-"""A direction of B below this part of the largest one is round-off."""
 
 
 @dataclass(frozen=True)
@@ -109,107 +107,24 @@ def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _orthonormal(b: Array, k: int, q: Array, r: Array, pivot: Index) -> int:
-    """Pivoted Gram-Schmidt, each step done twice, of the first k rows of b (k, 3): q (k, 3), r (3, 3) upper.
-
-    ``pivot`` becomes the order of the columns. Returns the rank.
-    """
-    for c in range(3):
-        pivot[c] = c
-        for i in range(k):
-            q[i, c] = b[i, c]
-        for d in range(3):
-            r[c, d] = 0.0
-    largest = 0.0
-    for c in range(3):
-        best, best_norm = c, -1.0
-        for d in range(c, 3):
-            norm = 0.0
-            for i in range(k):
-                norm += q[i, d] * q[i, d]
-            if norm > best_norm:
-                best, best_norm = d, norm
-        if best != c:
-            pivot[c], pivot[best] = pivot[best], pivot[c]
-            for i in range(k):
-                q[i, c], q[i, best] = q[i, best], q[i, c]
-            for i in range(c):
-                r[i, c], r[i, best] = r[i, best], r[i, c]
-        for e in range(c):  # second pass against the directions already found
-            dot = 0.0
-            for i in range(k):
-                dot += q[i, e] * q[i, c]
-            r[e, c] += dot
-            for i in range(k):
-                q[i, c] -= dot * q[i, e]
-        norm = 0.0
-        for i in range(k):
-            norm += q[i, c] * q[i, c]
-        norm = np.sqrt(norm)
-        if c == 0:
-            largest = norm
-        if not norm > ROUND_OFF * largest:
-            return c
-        r[c, c] = norm
-        for i in range(k):
-            q[i, c] /= norm
-        for d in range(c + 1, 3):
-            dot = 0.0
-            for i in range(k):
-                dot += q[i, c] * q[i, d]
-            r[c, d] = dot
-            for i in range(k):
-                q[i, d] -= dot * q[i, c]
-    return 3
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _gather(j: int, first: Offsets, weight: Array, by_ground: Array, y: Array, rays: Offsets, root: Array, b: Array, t: Array) -> int:
-    """Collect the accepted rays of point j: their rows, square roots of weights, stacked B and y. Returns their number."""
-    n = 0
-    for i in range(first[j], first[j + 1]):
-        if weight[i] > 0.0:
-            rays[n], root[n] = i, np.sqrt(weight[i])
-            for c in range(2):
-                t[2 * n + c] = root[n] * y[i, c]
-                for d in range(3):
-                    b[2 * n + c, d] = root[n] * by_ground[i, c, d]
-            n += 1
-    return n
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _most_rays(first: Offsets) -> int:
-    most = 1
-    for j in range(len(first) - 1):
-        most = max(most, first[j + 1] - first[j])
-    return most
-
-
-@numba.njit(cache=True, error_model="numpy")
 def _eliminate(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, information: Array, vector: Array
 ) -> tuple[float, int]:
     p = by_parameters.shape[2]
-    most = _most_rays(first)
+    most = most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
     misclosure, redundancy = 0.0, 0
     for j in range(len(first) - 1):
-        n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+        n = gather(j, first, weight, by_ground, y, rays, root, b, t)
         if n == 0:
             continue
-        rank = _orthonormal(b, 2 * n, q, r, pivot)
+        rank = orthonormal(b, 2 * n, q, r, pivot)
         if 2 * n <= rank:
             continue
         redundancy += 2 * n - rank
-        for e in range(rank):
-            dot = 0.0
-            for i in range(2 * n):
-                dot += q[i, e] * t[i]
-            for i in range(2 * n):
-                t[i] -= dot * q[i, e]
+        remove_ground(q, rank, 2 * n, t)
         for i in range(2 * n):
             misclosure += t[i] * t[i]
         for a in range(n):
@@ -245,16 +160,16 @@ def _point_factors(
     rank_of = np.zeros(points, np.int64)
     offset, own = np.zeros((points, 3)), np.full((points, 3, 3), np.nan)
     loading = np.zeros((len(by_ground), 3, p))
-    most = _most_rays(first)
+    most = most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot = np.empty((3, 3)), np.empty(3, np.int32)
     inverse = np.empty((3, 3))
     for j in range(points):
-        n = _gather(j, first, weight, by_ground, y, rays, root, b, t)
+        n = gather(j, first, weight, by_ground, y, rays, root, b, t)
         if n == 0:
             continue
-        rank_of[j] = _orthonormal(b, 2 * n, q, r, pivot)
+        rank_of[j] = orthonormal(b, 2 * n, q, r, pivot)
         if rank_of[j] < 3:
             continue
         # rows of ``inverse`` are those of R^-1, put back into the order of the coordinates

@@ -201,7 +201,8 @@ def monolithic(problem: Equations) -> tuple[Array, Array]:
     """Positions (n, 3) and joint covariance (3 n, 3 n) of all points by one least-squares adjustment of all unknowns."""
     q, n = problem.whitened, len(problem.point_ids)
     design = np.block([[problem.by_images, problem.by_ground], [np.eye(q), np.zeros((q, 3 * n))]])
-    inverse = np.linalg.pinv(design)[q:]
+    orthogonal, triangle = la.qr(design, mode="economic")
+    inverse = la.solve_triangular(triangle, orthogonal.T)[q:]
     return problem.origin + (inverse @ problem.data).reshape(n, 3), inverse @ inverse.T
 
 

@@ -386,7 +386,7 @@ def far(angle: float) -> float:
     return min(10.0 / angle, 1e7)
 
 
-@pytest.mark.parametrize("angle", [1e-1, 1e-3, 1e-5, 1e-7, 1e-9])
+@pytest.mark.parametrize("angle", [1e-1, 1e-3, 1e-5, 1e-7, 1e-9, 1e-11])
 def test_rays_that_meet_at_a_tiny_angle_stay_consistent(angle: float) -> None:
     network = weak_network(angle)
     linear = network.linear

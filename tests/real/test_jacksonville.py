@@ -258,8 +258,10 @@ def test_the_same_network(networks: Networks, one: str, other: str) -> None:
 
 
 def test_serial_is_two_workers(networks: Networks) -> None:
-    """The same tasks in other processes: the same numbers, but for sums that BLAS forms in another order with another number of threads, which
-    the condition of the images' information (1e9, one image being released) makes larger."""
+    """The same tasks in other processes: the same numbers, but for sums that BLAS forms in another order with another number of threads.
+
+    The condition of the images' information is 1e9, one image being released: what differs by 1e-16 there may differ by 1e-11 here.
+    """
     serial, workers = networks["base"], networks["two workers"]
     assert np.abs(serial.positions - workers.positions).max() <= 2e-9  # two steps of float64 at the Earth's radius
     assert largest_difference(workers.control.covariance, serial.control.covariance) <= 1e-10

@@ -18,7 +18,7 @@ from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
 from submin.adjustment.rays import Rays, sorted_rays
 from submin.errors import NumericalError
-from submin.geodesy import WGS84, geodetic_to_geocentric, local_axes
+from submin.geodesy import WGS84, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
 from submin.network.sub_min import GroundPart, joint_covariance, loadings
 from submin.sensors import sensor_named
 
@@ -338,6 +338,19 @@ def test_single_ray_is_cut_at_the_mean_height() -> None:
     expected = geodetic_to_geocentric(block.images.localise(rays.image, rays.observed), WGS84)
     np.testing.assert_allclose(found.geocentric, expected, rtol=0.0, atol=1e-3)
     assert found.misfit.max() < 1e-3
+
+
+def test_nearly_parallel_rays_stay_near_the_mean_height() -> None:
+    # a micro-radian apart and a pixel's third off each other: they meet 150 km up
+    images = image_set(((0.2, 0.0), (0.2 + 1e-6, 0.0)))
+    ground = geodetic_to_geocentric(np.array([CENTRE]))
+    both = np.zeros(2, dtype=np.int32)
+    image = np.arange(2, dtype=np.int32)
+    exact = images.project(np.zeros((2, P)), images.ground(ground), image, both).image
+    rays = Rays(both, image, exact + np.array([[0.0, 0.0], [0.3, 0.0]]), np.full((2, 2), 0.3), np.ones(2, dtype=np.bool_))
+    found = intersect(images, rays, 1).geocentric
+    height = geocentric_to_geodetic(found)[0, 2] - CENTRE[2]
+    assert 1.0 < abs(height) < 50.0
 
 
 def test_point_that_its_camera_does_not_reach_is_nan_and_the_others_are_not() -> None:

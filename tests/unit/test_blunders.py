@@ -229,6 +229,23 @@ def test_statistics_of_good_rays_are_normal() -> None:
     assert p * rays > spread / 4.0
 
 
+def test_statistics_are_residuals_over_their_standard_deviations() -> None:
+    simulation = simulate(201, points(2, 3, 5, of_each=4), images=5)
+    linear, found = simulation.linear, estimate(simulation)
+    weight, statistic = judged_together(simulation)
+    assert weight.all()
+    for j in range(len(linear.first) - 1):
+        rows = np.arange(linear.first[j], linear.first[j + 1])
+        by_image = np.zeros((len(rows), 2, simulation.images, P))
+        by_image[np.arange(len(rows)), :, linear.image[rows]] = linear.by_parameters[rows]
+        a, b = by_image.reshape(2 * len(rows), -1), linear.by_ground[rows].reshape(-1, 3)
+        left = np.eye(len(b)) - b @ np.linalg.pinv(b)
+        residual = left @ (linear.y[rows].ravel() - a @ found.theta.ravel())
+        variance = np.diag(left - left @ a @ found.covariance @ a.T @ left)
+        w = np.where(variance > 1e-3, np.abs(residual) / np.sqrt(np.maximum(variance, 1e-3)), 0.0)
+        np.testing.assert_allclose(statistic[rows], w.reshape(-1, 2).max(axis=1), rtol=1e-6)
+
+
 def test_statistics_allow_for_poorly_known_images() -> None:
     # two images with eight points in all: without the images' covariance the residuals would look far too small
     squares = []

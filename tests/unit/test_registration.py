@@ -311,15 +311,16 @@ def test_every_ray_is_in_one_cell_exactly_once(batches: list[list[int]]) -> None
         assert cell.number == cell_at(cell.origin[row])
 
 
-def test_points_of_other_names_in_the_cell_that_the_directory_names_are_not_taken_for_it() -> None:
+@pytest.mark.parametrize("twin", ["a twin", "twin"])
+def test_points_of_other_names_in_the_cell_that_the_directory_names_are_not_taken_for_it(twin: str) -> None:
     # two ids of one hash: the directory names the cell of the other point
     fused = Fused()
     fused.add(arriving(["p"], THERE, [0, 1]))
     number = fused.cell_of("p")[0].number
     elsewhere = places([-330.0], [-340.0])
-    fused.add(arriving(["twin"], elsewhere, [0, 1]), directory={"twin": number})
-    assert fused.cell_of("twin")[0].number == cell_at(elsewhere[0]) != number
-    assert len(fused.rays_of("p")) == 2 and len(fused.rays_of("twin")) == 2
+    fused.add(arriving([twin], elsewhere, [0, 1]), directory={twin: number})
+    assert fused.cell_of(twin)[0].number == cell_at(elsewhere[0]) != number
+    assert len(fused.rays_of("p")) == 2 and len(fused.rays_of(twin)) == 2
 
 
 def test_one_id_at_two_places_shows_in_the_misfit() -> None:
