@@ -58,6 +58,24 @@ def _residuals(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _drop(variance: Array, v0: float, v1: float, testable: float) -> float:
+    """By how much the weighted squares drop when a ray with residuals v0, v1 of this covariance (2, 2) is left out: ``v' V^-1 v``.
+
+    A direction that nothing checks (variance below ``testable``) does not count.
+    """
+    mean, half = 0.5 * (variance[0, 0] + variance[1, 1]), 0.5 * (variance[0, 0] - variance[1, 1])
+    spread = np.hypot(half, variance[0, 1])
+    angle = 0.5 * np.arctan2(variance[0, 1], half)
+    along, across = np.cos(angle) * v0 + np.sin(angle) * v1, np.cos(angle) * v1 - np.sin(angle) * v0
+    drop = 0.0
+    if mean + spread >= testable:
+        drop += along * along / (mean + spread)
+    if mean - spread >= testable:
+        drop += across * across / (mean - spread)
+    return drop
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _snoop(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array,
     theta: Array, covariance: Array, critical: float, testable: float, statistic: Array,
@@ -71,7 +89,7 @@ def _snoop(
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
-    row = np.empty(most * p)
+    row, product, variance = np.empty((2, most * p)), np.empty((2, most * p)), np.empty((2, 2))
     for j in range(len(first) - 1):
         while True:
             n = gather(j, first, weight, by_ground, y, rays, root, b, t)
@@ -89,22 +107,15 @@ def _snoop(
                     for e in range(rank):
                         z[a, e, u] = q[2 * a, e] * by_parameters[i, 0, u] + q[2 * a + 1, e] * by_parameters[i, 1, u]
             remove_ground(q, rank, 2 * n, t)
-            worst, worst_w = -1, 0.0
+            worst, worst_drop, worst_w = 0, -1.0, 0.0
             for a in range(n):
-                statistic[rays[a]] = 0.0
                 for c in range(2):
-                    free = 1.0
-                    for e in range(rank):
-                        free -= q[2 * a + c, e] ** 2
-                    if free < testable:
-                        continue
                     for s in range(n):
                         for u in range(p):
                             value = by_parameters[rays[s], c, u] if s == a else 0.0
                             for e in range(rank):
                                 value -= q[2 * a + c, e] * z[s, e, u]
-                            row[s * p + u] = value
-                    variance = free
+                            row[c, s * p + u] = value
                     for s in range(n):
                         at = image[rays[s]] * p
                         for u in range(p):
@@ -112,20 +123,29 @@ def _snoop(
                             for s2 in range(n):
                                 to = image[rays[s2]] * p
                                 for v in range(p):
-                                    total += covariance[at + u, to + v] * row[s2 * p + v]
-                            variance -= row[s * p + u] * total
-                    if variance < testable * testable:
-                        continue
-                    w = abs(t[2 * a + c]) / np.sqrt(variance)
-                    statistic[rays[a]] = max(statistic[rays[a]], w)
-                    if w > worst_w:
-                        worst, worst_w = a, w
+                                    total += covariance[at + u, to + v] * row[c, s2 * p + v]
+                            product[c, s * p + u] = total
+                for c in range(2):
+                    for d in range(2):
+                        variance[c, d] = 1.0 if c == d else 0.0
+                        for e in range(rank):
+                            variance[c, d] -= q[2 * a + c, e] * q[2 * a + d, e]
+                        for k in range(n * p):
+                            variance[c, d] -= row[c, k] * product[d, k]
+                statistic[rays[a]] = 0.0
+                for c in range(2):
+                    if variance[c, c] >= testable:
+                        statistic[rays[a]] = max(statistic[rays[a]], abs(t[2 * a + c]) / np.sqrt(variance[c, c]))
+                worst_w = max(worst_w, statistic[rays[a]])
+                drop = _drop(variance, t[2 * a], t[2 * a + 1], testable)
+                if drop > worst_drop:
+                    worst, worst_drop = a, drop
             if not worst_w > critical:
                 break
             if n == 2:  # two rays cannot be told apart: the point goes
                 weight[rays[0]] = 0.0
                 weight[rays[1]] = 0.0
-                statistic[rays[1 - worst]] = worst_w
+                statistic[rays[0]] = statistic[rays[1]] = worst_w
             weight[rays[worst]] = 0.0
 
 
@@ -155,7 +175,8 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
 
     Notes
     -----
-    Each point is judged by itself: its worst ray goes first and the rest are tested again. Of two rays that contradict each other both go.
+    Each point is judged by itself. While a coordinate of any of its rays exceeds the critical value, the ray goes without which the weighted
+    squares drop most, and the rest are tested again. Of two rays that contradict each other both go.
     """
     judged, statistic = weight.copy(), np.zeros(len(weight))
     _snoop(

@@ -54,7 +54,7 @@ class Equations:
     @property
     def whitened(self) -> int:
         """Number q of whitened image parameters."""
-        return self.by_images.shape[1]
+        return int(self.by_images.shape[1])
 
     @property
     def data(self) -> Array:
@@ -80,7 +80,9 @@ def equations(network: Network) -> Equations:
     ellipsoid = network.snapshot.metadata.ellipsoid
     factor = a_priori_factor(images)
     p = factor.shape[0] // len(images)
-    by_images, by_ground, y, ids, cell_of_point, origin, point_of_row, row_cell = [], [], [], [], [], [], [], []
+    by_images, by_ground, y, cell_of_point, origin, point_of_row, row_cell = [], [], [], [], [], [], []
+    ids: list[NDArray[np.str_]] = []
+    points = 0
     for number in network.cell_numbers():
         cell = network.cell(number)
         count = np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell))
@@ -101,7 +103,8 @@ def equations(network: Network) -> Equations:
         by_ground.append((projection.by_ground / rays.sigma[:, :, None]).reshape(-1, 3))
         y.append((reduced / rays.sigma).ravel())
         seen = np.flatnonzero(count >= 2)
-        point_of_row.append(np.repeat(np.searchsorted(seen, rays.point) + sum(len(i) for i in ids), 2))
+        point_of_row.append(np.repeat(np.searchsorted(seen, rays.point) + points, 2))
+        points += len(seen)
         row_cell.append(np.full(2 * len(rays), number))
         ids.append(cell.point_ids[seen])
         cell_of_point.append(np.full(len(seen), number))

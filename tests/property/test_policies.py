@@ -208,17 +208,17 @@ def test_a_naive_independent_merge_is_not_consistent(overlapping: Made, merge: s
         own, loading = fitted(problem, union)
         linear_map = own + loading @ weighted_sum(of_tiles, [1.0, 1.0])
         believed = np.linalg.inv(sum(part.root.T @ part.root for part in of_tiles))
-        reported = own @ own.T + loading @ believed @ loading.T
+        reported = np.asarray(own @ own.T + loading @ believed @ loading.T)
     else:
         total = np.zeros((3 * len(union), 3 * len(union)))
         right = np.zeros((3 * len(union), len(problem.data)))
         for part, of_tile in zip(of_tiles, ids, strict=True):
-            alone = located(problem, np.linalg.solve(part.root, part.map), of_tile)
+            alone = located(problem, weighted_sum([part], [1.0]), of_tile)
             weight = np.linalg.inv(alone @ alone.T)
             at = np.flatnonzero(np.repeat(np.isin(union, of_tile), 3))
             total[np.ix_(at, at)] += weight
             right[at] += weight @ alone
-        reported = np.linalg.inv(total)
+        reported = np.asarray(np.linalg.inv(total))
         linear_map = reported @ right
     ratio = largest_ratio(linear_map @ linear_map.T, reported)
     assert 1.5 < ratio <= 2.0 + 1e-6
