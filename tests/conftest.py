@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+# One BLAS thread, as every worker has: matrices are small here, and two threads on two busy cores wait for each other.
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
 ROOT = Path(__file__).parents[1]
 
 

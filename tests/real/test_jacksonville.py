@@ -45,6 +45,8 @@ PARTS = 4
 EQUAL = 1e-9
 SAME_METRES = 1e-4
 SAME_COVARIANCE = 1e-4
+MORE = 1.0 + 1e-4
+"""Ratio of accuracies that is no round-off."""
 
 
 @dataclass(frozen=True)
@@ -282,7 +284,8 @@ def test_one_tile_alone_is_never_better_than_all(base: Made, tile: str) -> None:
     at = np.searchsorted(everything.ids, alone.ids)
     assert (alone.ce90 >= everything.ce90[at] * (1.0 - EQUAL)).all()
     assert (alone.le90 >= everything.le90[at] * (1.0 - EQUAL)).all()
-    assert np.median(alone.ce90 / everything.ce90[at]) > 1.01
+    # the datum, which only the a priori model gives, makes most of CE90; but alone is not all
+    assert np.median(alone.ce90 / everything.ce90[at]) > MORE
 
 
 def test_covariance_intersection_is_never_better_than_rigorous(base: Made) -> None:
@@ -291,7 +294,7 @@ def test_covariance_intersection_is_never_better_than_rigorous(base: Made) -> No
     assert np.array_equal(ci.ids, base.control.ids)
     assert (ci.ce90 >= base.control.ce90 * (1.0 - EQUAL)).all()
     assert (ci.le90 >= base.control.le90 * (1.0 - EQUAL)).all()
-    assert np.median(ci.ce90 / base.control.ce90) > 1.01
+    assert np.median(ci.ce90 / base.control.ce90) > MORE
 
 
 @pytest.mark.parametrize("policy", ["tile", "ci"])

@@ -156,7 +156,7 @@ def planted(block: Block, seed: int) -> tuple[Block, NDArray[np.str_]]:
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_planted_mismatches_are_found(networks: Networks, tmp_path: Path, seed: int) -> None:
-    """Forty gross mismatches among 3,911 points: they lose rays, no good point does, no camera is blamed, and the images stay where they were.
+    """Forty gross mismatches among 3,911 points: they lose rays, no good point does, no camera is blamed, the images stay where they were.
 
     With seed 3 a tile of 89 rays has three of them.
     """
