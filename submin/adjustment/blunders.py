@@ -175,8 +175,8 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
 
     Notes
     -----
-    Each point is judged by itself. While a coordinate of any of its rays exceeds the critical value, the ray goes without which the weighted
-    squares drop most, and the rest are tested again. Of two rays that contradict each other both go.
+    Each point is judged by itself. While a coordinate of any of its rays exceeds the critical value, the ray goes without which the
+    weighted squares drop most, and the rest are tested again. Of two rays that contradict each other both go.
     """
     judged, statistic = weight.copy(), np.zeros(len(weight))
     _snoop(

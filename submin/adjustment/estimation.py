@@ -57,7 +57,7 @@ def fill_symmetric(lower: Array) -> Array:
     for start in range(0, size, MIRROR_BLOCK):
         stop = min(start + MIRROR_BLOCK, size)
         square = lower[start:stop, start:stop]
-        square += np.tril(square, -1).T - np.triu(square, 1)
+        square[...] = np.tril(square) + np.tril(square, -1).T  # what LAPACK left above the diagonal must not take part
         lower[start:stop, stop:] = lower[stop:, start:stop].T
     return lower
 
@@ -78,6 +78,8 @@ def cholesky(matrix: Array) -> Array:
         raise NumericalError(
             f"the information matrix ({len(matrix)} parameters) is not positive definite at row {info - 1}; a sum of cells is damaged"
         )
+    if not np.isfinite(np.diagonal(factor)).all():  # LAPACK does not look for NaN
+        raise NumericalError(f"the information matrix ({len(matrix)} parameters) is not finite; a camera or a measurement is not")
     return np.asarray(factor)
 
 

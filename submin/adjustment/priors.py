@@ -23,7 +23,8 @@ from submin.errors import InputError
 Array = NDArray[np.float64]
 
 RELEASE_FACTOR = 100.0
-"""Sigmas of an image whose camera was found to be bad are multiplied by this: its position is left to the network (decision 004)."""
+"""Sigmas of an image whose camera was found to be bad are multiplied by this, and it is correlated with no other: its position is left to
+the network (decision 004)."""
 
 CORRELATION_MODELS = ("none", "fixed", "exponential", "gaussian")
 
@@ -139,10 +140,15 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     for members in blocks.values():
         model = images[members[0]].a_priori
         own = np.full((len(members), p), model.drift_px)
+        released = np.array([images[i].released for i in members])
         for k, i in enumerate(members):
-            own[k, list(images[i].bias)] = model.bias_px * np.sqrt(1.0 - model.common_to_pass)
-            own[k] *= RELEASE_FACTOR if images[i].released else 1.0
-        factor = correlation_factor(model.correlations(np.array([images[i].seconds for i in members])))
+            own[k, list(images[i].bias)] = model.bias_px * (1.0 if released[k] else np.sqrt(1.0 - model.common_to_pass))
+        own[released] *= RELEASE_FACTOR
+        # what a bad camera does says nothing of its neighbours: correlated at a hundred times the sigma, it would pin them
+        correlation = model.correlations(np.array([images[i].seconds for i in members]))
+        alone = released[:, None] | released[None, :]
+        np.fill_diagonal(alone, False)
+        factor = correlation_factor(np.where(alone, 0.0, correlation))
         at = np.array(members)
         for c in range(p):
             row, column = np.meshgrid(at * p + c, at * p + c, indexing="ij")

@@ -162,9 +162,9 @@ class RpcSensor:
         for k, name in enumerate(POLYNOMIALS):
             start = _COEFFICIENTS + TERMS * k
             packed[start : start + TERMS] = _coefficients(camera, name)
-        if not (width > 0 and height > 0):
+        if not (width > 0 and height > 0 and np.isfinite([width, height]).all()):
             raise InputError(f"RPC: image size is {width} x {height}; expected positive numbers of pixels")
-        origin = np.asarray(camera.get("origin", (0.0, 0.0)), dtype=np.float64)
+        origin = _origin(camera)
         packed[_CENTRE_SAMPLE] = origin[0] + 0.5 * (width - 1.0)
         packed[_CENTRE_LINE] = origin[1] + 0.5 * (height - 1.0)
         packed[_HALF_WIDTH], packed[_HALF_HEIGHT] = 0.5 * width, 0.5 * height
@@ -193,6 +193,17 @@ def _number(camera: Mapping[str, Any], name: str) -> float:
     if not np.isfinite(value):
         raise InputError(f"RPC: {name} is {value}; expected a finite number")
     return value
+
+
+def _origin(camera: Mapping[str, Any]) -> NDArray[np.float64]:
+    value = camera.get("origin", (0.0, 0.0))
+    try:
+        origin = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        origin = np.empty(0)
+    if origin.shape != (2,) or not np.isfinite(origin).all():
+        raise InputError(f"RPC: origin is {value!r}; expected the sample and line of the image's first pixel, two finite numbers")
+    return origin
 
 
 def _coefficients(camera: Mapping[str, Any], name: str) -> NDArray[np.float64]:

@@ -77,6 +77,8 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
     if "://" not in place and Path(place).exists() and (not Path(place).is_dir() or any(Path(place).iterdir())):
         raise StoreError(f"{place}: already exists; choose another place, or remove it first")
     try:
+        if "://" not in place:  # Icechunk panics where it cannot make the folder
+            Path(place).mkdir(parents=True, exist_ok=True)
         repository = icechunk.Repository.create(_storage(place))
         session = repository.writable_session(BRANCH)
         root = zarr.create_group(session.store, attributes=metadata.to_attributes() | {"version": 0})

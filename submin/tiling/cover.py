@@ -263,12 +263,27 @@ def cover_area(area: BaseGeometry, core: float, overlap: float, ellipsoid: Ellip
             f"the area spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, which is not on a globe"
             + ("; its axes look swapped: expected longitude first, then latitude" if swapped else "")
         )
+    area = _unwrapped(area)
+    west, south, east, north = area.bounds
     centre = (0.5 * (west + east), 0.5 * (south + north))
     frame = Cover(centre, (0.0, 0.0), 1, 1, core, overlap, ellipsoid)
     outline = shapely.get_coordinates(shapely.segmentize(area, max(0.01 * max(east - west, north - south), 1e-9)))
     x, y = frame.plane(outline[:, 0], outline[:, 1])
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise InputError(
+            "the area reaches to the point opposite its middle, where no equal-area plane reaches; take less than a hemisphere"
+        )
     # A touch of tolerance: an area of exactly three cores is three cores, not four.
     columns = max(int(np.ceil((x.max() - x.min()) / core - 1e-3)), 1)
     rows = max(int(np.ceil((y.max() - y.min()) / core - 1e-3)), 1)
     origin = (0.5 * (x.max() + x.min()) - 0.5 * columns * core, 0.5 * (y.max() + y.min()) - 0.5 * rows * core)
     return Cover(centre, origin, rows, columns, core, overlap, ellipsoid)
+
+
+def _unwrapped(area: BaseGeometry) -> BaseGeometry:
+    """The area in one piece where it was cut at the antimeridian: its western parts at longitudes beyond 180."""
+    parts = shapely.get_parts(area)
+    west_of_zero = shapely.bounds(parts)[:, 2] <= 0.0
+    turned = np.where(west_of_zero, shapely.transform(parts, lambda at: at + [360.0, 0.0]), parts)
+    whole = shapely.union_all(turned)
+    return whole if whole.bounds[2] - whole.bounds[0] < area.bounds[2] - area.bounds[0] else area

@@ -137,9 +137,7 @@ def prior_covariance(images: Sequence[tuple[str, bool, str]]) -> Array:
     return covariance
 
 
-def stored_observations(
-    snapshot: Snapshot, *, every_ray: bool = False, unreleased: frozenset[str] = frozenset()
-) -> Observations:
+def stored_observations(snapshot: Snapshot, *, every_ray: bool = False, unreleased: frozenset[str] = frozenset()) -> Observations:
     """What a network of RPC images has accepted, each ray at the linearisation that its cell keeps.
 
     A point with one accepted ray has fewer observations than coordinates: it has no place and says nothing about images; it is left out.
