@@ -284,6 +284,6 @@ def _unwrapped(area: BaseGeometry) -> BaseGeometry:
     """The area in one piece where it was cut at the antimeridian: its western parts at longitudes beyond 180."""
     parts = shapely.get_parts(area)
     west_of_zero = shapely.bounds(parts)[:, 2] <= 0.0
-    turned = np.where(west_of_zero, shapely.transform(parts, lambda at: at + [360.0, 0.0]), parts)
+    turned = np.where(west_of_zero, shapely.transform(parts, lambda at: at + np.array([360.0, 0.0])), parts)
     whole = shapely.union_all(turned)
     return whole if whole.bounds[2] - whole.bounds[0] < area.bounds[2] - area.bounds[0] else area
