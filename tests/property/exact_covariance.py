@@ -13,8 +13,9 @@ image parameters' a priori values.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -122,29 +123,38 @@ def equations(network: Network) -> Equations:
 
 
 def a_priori_factor(images: Sequence[NetworkImage]) -> Array:
-    """K (m p, q), dense: own parts of the images of a block by a Cholesky factor of their correlation, then two columns a pass."""
+    """K (m p, q), dense: own parts of the images of a block by a Cholesky factor of their correlation, then two columns a pass.
+
+    A released image has a hundred times the sigmas, and no correlation with its block (docs/decisions/004-blunders-and-bad-cameras.md).
+    """
     m, p = len(images), sensor_named("rpc").parameters
     bias = np.isin(np.arange(p), sensor_named("rpc").bias)
     models = [json.loads(image.a_priori) for image in images]
     passes = list(dict.fromkeys(image.pass_id for image in images))
     factor = np.zeros((m, p, m * p + 2 * len(passes)))
-    for block in dict.fromkeys(image.block_id for image in images):
-        members = [i for i, image in enumerate(images) if image.block_id == block]
-        model, seconds = models[members[0]], np.array([images[i].seconds for i in members])
-        correlation = np.eye(len(members))
-        if model["correlation"] == "exponential":
-            correlation = np.exp(-np.abs(seconds[:, None] - seconds) / model["correlation_parameter"])
-        else:
-            assert model["correlation"] == "none"
-        root = np.linalg.cholesky(correlation)
-        own = np.where(bias, model["bias_px"] * np.sqrt(1.0 - model["common_to_pass"]), model["drift_px"])
-        for a, i in enumerate(members):
-            for b, k in enumerate(members):
-                factor[i, np.arange(p), p * k + np.arange(p)] = root[a, b] * own * (RELEASED if images[i].released else 1.0)
     for i, image in enumerate(images):
         column = m * p + 2 * passes.index(image.pass_id)
         factor[i, np.flatnonzero(bias), [column, column + 1]] = models[i]["bias_px"] * np.sqrt(models[i]["common_to_pass"])
+        if image.released:
+            sigma = np.where(bias, models[i]["bias_px"], models[i]["drift_px"])
+            factor[i, np.arange(p), p * i + np.arange(p)] = RELEASED * sigma
+    for block in dict.fromkeys(image.block_id for image in images):
+        members = [i for i, image in enumerate(images) if image.block_id == block and not image.released]
+        seconds = np.array([images[i].seconds for i in members])
+        for a, row in enumerate(np.linalg.cholesky(correlation(models[members[0]], seconds)) if members else ()):
+            model = models[members[a]]
+            own = np.where(bias, model["bias_px"] * np.sqrt(1.0 - model["common_to_pass"]), model["drift_px"])
+            for b, value in enumerate(row):
+                factor[members[a], np.arange(p), p * members[b] + np.arange(p)] = value * own
     return factor.reshape(m * p, -1)
+
+
+def correlation(model: Mapping[str, Any], seconds: Array) -> Array:
+    """Correlation (n, n) of the own parts of n images of a block, taken at these times."""
+    if model["correlation"] == "exponential":
+        return np.asarray(np.exp(-np.abs(seconds[:, None] - seconds) / model["correlation_parameter"]))
+    assert model["correlation"] == "none"
+    return np.eye(len(seconds))
 
 
 def information(problem: Equations, cells: NDArray[np.int64]) -> Information:

@@ -56,7 +56,9 @@ class Case:
 CASES = {
     "overlap": Case(replace(CLEAN, seed=5, priors=APriori(correlation="exponential", correlation_parameter=20.0)), 60.0, 20.0),
     "no overlap": Case(replace(CLEAN, seed=8), 40.0, 0.0, batch_blocks=5),
-    "released camera": Case(replace(CLEAN, seed=1, bad_cameras=1), 60.0, 20.0),
+    "released camera": Case(
+        replace(CLEAN, seed=1, bad_cameras=1, priors=APriori(correlation="exponential", correlation_parameter=60.0)), 60.0, 20.0
+    ),
 }
 
 ONE_TILE = ("one cell", "overlap of two", "overlap of four")

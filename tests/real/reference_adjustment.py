@@ -32,7 +32,7 @@ P = 6
 """Adjustable parameters of an RPC: three for the sample, three for the line, each a shift and two drifts."""
 SHIFTS = (0, 3)
 RELEASE = 100.0
-"""Factor on the sigmas of an image's own part once its camera was found bad (decision 004)."""
+"""Factor on the sigmas of an image once its camera was found bad (decision 004)."""
 
 CONVERGED_METRES = 1e-8
 CONVERGED_PIXELS = 1e-8
@@ -122,14 +122,14 @@ def prior_covariance(images: Sequence[tuple[str, bool, str]]) -> Array:
 
     Each image is given by its pass, whether it is released, and the JSON text of its a priori model, by which images of a block are not
     correlated. An image's own part has the drifts and what is left of the shifts' variance; its pass has the rest, the same for all its
-    images, released ones too.
+    images. A released image has a hundred times the sigmas of the whole as its own part, and its pass's part as before.
     """
     covariance = np.zeros((P * len(images), P * len(images)))
     for i, (pass_i, released, text) in enumerate(images):
         model = json.loads(text)
         assert model["correlation"] == "none", "the reference knows no correlation within a block"
         own = np.full(P, model["drift_px"] ** 2)
-        own[list(SHIFTS)] = (1.0 - model["common_to_pass"]) * model["bias_px"] ** 2
+        own[list(SHIFTS)] = model["bias_px"] ** 2 * (1.0 if released else 1.0 - model["common_to_pass"])
         covariance[P * i : P * i + P, P * i : P * i + P] += np.diag(own * (RELEASE**2 if released else 1.0))
         for k, (pass_k, _, _) in enumerate(images):
             for c in SHIFTS if pass_k == pass_i else ():
