@@ -98,7 +98,8 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
             linear, candidates if judgements <= FREE_DECISIONS else weight, theta, estimate.covariance
         )  # fmt: skip
         worst = image_statistics(theta, estimate.covariance, prior_variance(images.prior, images.parameters))
-        bad = bad_cameras(worst, linear) & ~released
+        # images are judged once the rays have been: a blunder must not be blamed on its camera
+        bad = bad_cameras(worst, linear) & ~released & np.array_equal(judged, weight)
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
         converged = (
             step_px < CONVERGED_PIXELS and step_m < CONVERGED_METRES and not bad.any() and bool(np.array_equal(judged, weight))

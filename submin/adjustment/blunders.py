@@ -19,6 +19,8 @@ CRITICAL_RAY = 4.0
 """A ray whose w exceeds this is a blunder (1 good coordinate in 16,000; decision 004 says why not 3.29)."""
 IMAGE_FAMILY = 0.05
 """Chance that any good image of a set adjusted together is said to have a bad camera (Bonferroni over all parameters tested)."""
+ALIKE = 0.9
+"""Rays without which the squares drop by more than this part of the largest drop are equally suspect."""
 TESTABLE = 0.01
 """A coordinate or parameter is tested when at least this part of its a priori variance is checked by other observations."""
 ROBUST_SCALE = 2.4
@@ -89,6 +91,7 @@ def _snoop(
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
+    drops = np.empty(most)
     row, product, variance = np.empty((2, most * p)), np.empty((2, most * p)), np.empty((2, 2))
     for j in range(len(first) - 1):
         while True:
@@ -107,7 +110,7 @@ def _snoop(
                     for e in range(rank):
                         z[a, e, u] = q[2 * a, e] * by_parameters[i, 0, u] + q[2 * a + 1, e] * by_parameters[i, 1, u]
             remove_ground(q, rank, 2 * n, t)
-            worst, worst_drop, worst_w = 0, -1.0, 0.0
+            worst_w = 0.0
             for a in range(n):
                 for c in range(2):
                     for s in range(n):
@@ -137,16 +140,15 @@ def _snoop(
                     if variance[c, c] >= testable:
                         statistic[rays[a]] = max(statistic[rays[a]], abs(t[2 * a + c]) / np.sqrt(variance[c, c]))
                 worst_w = max(worst_w, statistic[rays[a]])
-                drop = _drop(variance, t[2 * a], t[2 * a + 1], testable)
-                if drop > worst_drop:
-                    worst, worst_drop = a, drop
+                drops[a] = _drop(variance, t[2 * a], t[2 * a + 1], testable)
             if not worst_w > critical:
                 break
-            if n == 2:  # two rays cannot be told apart: the point goes
-                weight[rays[0]] = 0.0
-                weight[rays[1]] = 0.0
-                statistic[rays[0]] = statistic[rays[1]] = worst_w
-            weight[rays[worst]] = 0.0
+            # rays that explain the contradiction equally well cannot be told apart: all of them go (of two rays, always both)
+            largest = drops[:n].max()
+            for a in range(n):
+                if drops[a] > ALIKE * largest:
+                    weight[rays[a]] = 0.0
+                    statistic[rays[a]] = max(statistic[rays[a]], worst_w) if n == 2 else statistic[rays[a]]
 
 
 def robust_weights(linear: LinearRays, weight: Array, theta: Array) -> Array:
@@ -176,7 +178,8 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
     Notes
     -----
     Each point is judged by itself. While a coordinate of any of its rays exceeds the critical value, the ray goes without which the
-    weighted squares drop most, and the rest are tested again. Of two rays that contradict each other both go.
+    weighted squares drop most, with any that does as well within `ALIKE`, and the rest are tested again. Of two rays that contradict each
+    other both go.
     """
     judged, statistic = weight.copy(), np.zeros(len(weight))
     _snoop(

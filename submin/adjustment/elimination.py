@@ -92,7 +92,7 @@ def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, 
     ``origin`` (n, 3) is the fixed origin of each point's coordinates.
     """
     ground = images.ground(linearised_at)
-    projection = images.project(theta, ground, rays.image, rays.point)
+    projection = images.project(theta, ground, rays.image, rays.point, rays.observed)
     y = rays.observed - projection.image
     y += np.einsum("rcp,rp->rc", projection.by_parameters, theta[rays.image])
     y += np.einsum("rck,rk->rc", projection.by_ground, (linearised_at - origin)[rays.point])

@@ -66,17 +66,18 @@ class ImageSet:
         """Ground points (n, 3) in metres in the forms that sensors need."""
         return Ground.at(geocentric, self.ellipsoid)
 
-    def project(self, parameters: Array, ground: Ground, image: Index, point: Index) -> Projection:
+    def project(self, parameters: Array, ground: Ground, image: Index, point: Index, at: Array | None = None) -> Projection:
         """Image coordinates of rays and their partials; see `submin.sensors.Sensor.project`."""
         names = set(self.sensors)
         if len(names) == 1 and sensor_named(self.sensors[0]).parameters == self.parameters:
-            return sensor_named(self.sensors[0]).project(self.cameras, parameters, ground, image, point)
+            return sensor_named(self.sensors[0]).project(self.cameras, parameters, ground, image, point, at)
         rays = len(image)
         whole = Projection(np.empty((rays, 2)), np.empty((rays, 2, 3)), np.zeros((rays, 2, self.parameters)))
         of_image = np.array(self.sensors, dtype=np.str_)
         for name in names:
             sensor, chosen = sensor_named(name), of_image[image] == name
-            part = sensor.project(self.cameras, parameters, ground, image[chosen], point[chosen])
+            where = None if at is None else at[chosen]
+            part = sensor.project(self.cameras, parameters, ground, image[chosen], point[chosen], where)
             whole.image[chosen], whole.by_ground[chosen] = part.image, part.by_ground
             whole.by_parameters[chosen, :, : sensor.parameters] = part.by_parameters
         return whole

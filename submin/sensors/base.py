@@ -70,8 +70,10 @@ class Sensor(Protocol):
         """Row of numbers that describes one camera, from its catalogue description; raises `InputError` when it is incomplete."""
         ...
 
-    def project(self, cameras: Array, parameters: Array, ground: Ground, image: Index, point: Index) -> Projection:
+    def project(self, cameras: Array, parameters: Array, ground: Ground, image: Index, point: Index, at: Array | None = None) -> Projection:
         """Project ray r: point ``point[r]`` into image ``image[r]``.
+
+        A correction that varies over the image is evaluated at the image coordinates ``at`` (r, 2), by default at the predicted ones.
 
         ``cameras`` (m, c) holds packed cameras, ``parameters`` (m, p) the corrections of the images' adjustable parameters.
         """

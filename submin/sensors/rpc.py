@@ -10,6 +10,10 @@ image, ``s = (sample_rpc - centre) / half width`` and ``l`` likewise:
 
     sample = sample_rpc + a0 + a1 s + a2 l                                line = line_rpc + b0 + b1 s + b2 l
 
+In an adjustment s and l are those of the *measured* coordinates: the correction is then linear in its parameters and the same wherever the
+point is linearised. Taken at the predicted coordinates they would move with the datum, and cells linearised at different datums would
+seem to know it.
+
 The centre of the first pixel is (0, 0).
 """
 
@@ -91,7 +95,9 @@ def _raw(camera: Array, geodetic: Array, sample: Array, line: Array) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _project(cameras: Array, parameters: Array, geodetic: Array, jacobian: Array, image: Index, point: Index) -> tuple[Array, Array, Array]:
+def _project(
+    cameras: Array, parameters: Array, geodetic: Array, jacobian: Array, image: Index, point: Index, at: Array
+) -> tuple[Array, Array, Array]:
     rays = len(image)
     predicted = np.empty((rays, 2))
     by_ground = np.empty((rays, 2, 3))
@@ -100,12 +106,15 @@ def _project(cameras: Array, parameters: Array, geodetic: Array, jacobian: Array
     for r in range(rays):
         camera, theta, j = cameras[image[r]], parameters[image[r]], point[r]
         _raw(camera, geodetic[j], sample, line)
-        s = (sample[0] - camera[_CENTRE_SAMPLE]) / camera[_HALF_WIDTH]
-        t = (line[0] - camera[_CENTRE_LINE]) / camera[_HALF_HEIGHT]
+        fixed = len(at) > 0
+        s = ((at[r, 0] if fixed else sample[0]) - camera[_CENTRE_SAMPLE]) / camera[_HALF_WIDTH]
+        t = ((at[r, 1] if fixed else line[0]) - camera[_CENTRE_LINE]) / camera[_HALF_HEIGHT]
         predicted[r, 0] = sample[0] + theta[0] + theta[1] * s + theta[2] * t
         predicted[r, 1] = line[0] + theta[3] + theta[4] * s + theta[5] * t
         ss, st = 1.0 + theta[1] / camera[_HALF_WIDTH], theta[2] / camera[_HALF_HEIGHT]
         ts, tt = theta[4] / camera[_HALF_WIDTH], 1.0 + theta[5] / camera[_HALF_HEIGHT]
+        if fixed:
+            ss, st, ts, tt = 1.0, 0.0, 0.0, 1.0
         for k in range(3):
             ds = sample[1] * jacobian[j, 0, k] + sample[2] * jacobian[j, 1, k] + sample[3] * jacobian[j, 2, k]
             dt = line[1] * jacobian[j, 0, k] + line[2] * jacobian[j, 1, k] + line[3] * jacobian[j, 2, k]
@@ -170,9 +179,10 @@ class RpcSensor:
         packed[_HALF_WIDTH], packed[_HALF_HEIGHT] = 0.5 * width, 0.5 * height
         return packed
 
-    def project(self, cameras: Array, parameters: Array, ground: Ground, image: Index, point: Index) -> Projection:
+    def project(self, cameras: Array, parameters: Array, ground: Ground, image: Index, point: Index, at: Array | None = None) -> Projection:
         """See `Sensor.project`."""
-        return Projection(*_project(cameras, parameters, ground.geodetic, ground.jacobian, image, point))
+        where = np.empty((0, 2)) if at is None else at
+        return Projection(*_project(cameras, parameters, ground.geodetic, ground.jacobian, image, point, where))
 
     def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array) -> Array:
         """See `Sensor.localise`."""

@@ -92,7 +92,8 @@ def equations(network: Network) -> Equations:
         assert {image.sensor for image in of_cell} <= {"rpc"}
         sensor = sensor_named("rpc")
         cameras = np.stack([sensor.pack(json.loads(i.camera), i.width, i.height) for i in of_cell])
-        projection = sensor.project(cameras, cell.theta, Ground.at(cell.linearised_at, ellipsoid), rays.image, rays.point)
+        ground = Ground.at(cell.linearised_at, ellipsoid)
+        projection = sensor.project(cameras, cell.theta, ground, rays.image, rays.point, rays.observed)
         moved = (cell.linearised_at - cell.origin)[rays.point]
         reduced = (
             rays.observed - projection.image

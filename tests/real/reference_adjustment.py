@@ -179,7 +179,7 @@ def adjust_linearised(observations: Observations) -> Solution:
     m, n = len(o.image_ids), len(o.point_ids)
     every = np.arange(rays, dtype=np.int32)
     # a camera and a state for every ray, because cells are linearised apart
-    projection = sensor_named("rpc").project(o.cameras[o.image], o.theta, Ground.at(o.ground), every, every)
+    projection = sensor_named("rpc").project(o.cameras[o.image], o.theta, Ground.at(o.ground), every, every, o.observed)
     y = o.observed - projection.image
     y += np.einsum("rcp,rp->rc", projection.by_parameters, o.theta)
     y += np.einsum("rck,rk->rc", projection.by_ground, o.ground - o.origin[o.point])
@@ -231,7 +231,7 @@ def ray_statistics(observations: Observations, theta: Array) -> Array:
     o, sensor, every = observations, sensor_named("rpc"), np.arange(len(observations.point), dtype=np.int32)
     ground = o.origin
     for _ in range(10):
-        projection = sensor.project(o.cameras[o.image], theta[o.image], Ground.at(ground[o.point]), every, every)
+        projection = sensor.project(o.cameras[o.image], theta[o.image], Ground.at(ground[o.point]), every, every, o.observed)
         v = (o.observed - projection.image) / o.sigma
         b = projection.by_ground / o.sigma[:, :, None]
         normal, right = np.zeros((len(ground), 3, 3)), np.zeros((len(ground), 3))

@@ -158,7 +158,8 @@ def test_result_is_a_minimum_of_the_weighted_squares() -> None:
     result = adjusted(block)
 
     def squares(theta: Array, ground: Array) -> float:
-        predicted = block.images.project(theta, block.images.ground(ground), block.rays.image, block.rays.point).image
+        rays = block.rays
+        predicted = block.images.project(theta, block.images.ground(ground), rays.image, rays.point, rays.observed).image
         u = np.linalg.pinv(block.images.prior.toarray()) @ theta.ravel()
         return float((((block.rays.observed - predicted) / block.rays.sigma) ** 2).sum() + u @ u)
 
