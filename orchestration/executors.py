@@ -140,7 +140,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
     with (
         # set before the workers load numpy
         dask.config.set({"distributed.nanny.pre-spawn-environ": threads, "distributed.worker.memory.terminate": False}),
-        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=40) as cluster,
+        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40) as cluster,
         Client(cluster) as client,
     ):
         yield DaskExecutor(client)

@@ -19,8 +19,6 @@ CRITICAL_RAY = 4.0
 """A ray whose w exceeds this is a blunder (1 good coordinate in 16,000; decision 004 says why not 3.29)."""
 IMAGE_FAMILY = 0.05
 """Chance that any good image of a set adjusted together is said to have a bad camera (Bonferroni over all parameters tested)."""
-ALIKE = 0.9
-"""Rays without which the squares drop by more than this part of the largest drop are equally suspect."""
 TESTABLE = 0.01
 """A coordinate or parameter is tested when at least this part of its a priori variance is checked by other observations."""
 ROBUST_SCALE = 2.4
@@ -143,12 +141,11 @@ def _snoop(
                 drops[a] = _drop(variance, t[2 * a], t[2 * a + 1], testable)
             if not worst_w > critical:
                 break
-            # rays that explain the contradiction equally well cannot be told apart: all of them go (of two rays, always both)
-            largest = drops[:n].max()
-            for a in range(n):
-                if drops[a] > ALIKE * largest:
-                    weight[rays[a]] = 0.0
-                    statistic[rays[a]] = max(statistic[rays[a]], worst_w) if n == 2 else statistic[rays[a]]
+            if n == 2:  # two rays cannot be told apart: the point goes
+                weight[rays[0]] = weight[rays[1]] = 0.0
+                statistic[rays[0]] = statistic[rays[1]] = worst_w
+            else:
+                weight[rays[np.argmax(drops[:n])]] = 0.0
 
 
 def robust_weights(linear: LinearRays, weight: Array, theta: Array) -> Array:
@@ -178,8 +175,7 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
     Notes
     -----
     Each point is judged by itself. While a coordinate of any of its rays exceeds the critical value, the ray goes without which the
-    weighted squares drop most, with any that does as well within `ALIKE`, and the rest are tested again. Of two rays that contradict each
-    other both go.
+    weighted squares drop most, and the rest are tested again. Of two rays that contradict each other both go.
     """
     judged, statistic = weight.copy(), np.zeros(len(weight))
     _snoop(

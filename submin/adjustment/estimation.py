@@ -93,6 +93,8 @@ def estimate_images(sums: Sums, prior: sp.csr_array, parameters: int) -> ImageEs
     NumericalError
         When the information is not positive definite, which sound sums never are.
     """
+    if not np.isfinite(sums.vector).all():
+        raise NumericalError(f"the right-hand side of {len(sums.vector)} image parameters is not finite; a camera or a position is not")
     factor = cholesky(reduced_information(sums.information, prior))
     right = prior.T @ sums.vector
     u, _ = la.lapack.dpotrs(factor, right, lower=1)

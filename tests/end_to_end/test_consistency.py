@@ -188,6 +188,7 @@ def test_a_blunder_is_not_blamed_on_its_camera(seed: int, tile_km: float, overla
     assert named[0] <= named[1]
 
 
+@pytest.mark.xfail(strict=True, reason="a known limit: docs/decisions/004-blunders-and-bad-cameras.md, caveats")
 @pytest.mark.parametrize("seed", [2, 12])
 def test_a_blunder_that_three_rays_cannot_locate_does_not_stay(seed: int, tmp_path: Path) -> None:
     """One blunder in fifty rays, some of them along the track in points of one triplet, where all three rays look equally bad."""
