@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from orchestration.change import Move, finish, place, settle, take_points
@@ -19,7 +18,7 @@ from submin.network.registration import SAME_POINT_METRES, LooseRays, together
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_point_of
 from submin.storage.ledger import Entry, Ledger
-from submin.storage.network_store import Snapshot, writable_session
+from submin.storage.network_store import Snapshot, begin_change
 
 BLOCKS_A_TASK = 8
 
@@ -60,8 +59,7 @@ def fuse_batch(where: str, blocks: Sequence[Block], rejected: Sequence[Rejected]
     ConflictError
         When another run has committed meanwhile; nothing of the batch is in the network then.
     """
-    session = writable_session(where)
-    base = Snapshot(zarr.open_group(session.store, mode="r"), where)
+    session, base = begin_change(where)
     refused = list(rejected)
     blocks = _stage_one(blocks, base, executor, reporter, refused)
     blocks, move = _register(blocks, base, refused)

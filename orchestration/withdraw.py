@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import zarr
 
 from orchestration.change import finish, place, settle, take_points_seen
 from orchestration.executors import Executor
@@ -15,7 +14,7 @@ from submin.errors import InputError
 from submin.network.registration import together
 from submin.storage.control_blocks import control_block_id
 from submin.storage.ledger import Entry, Ledger
-from submin.storage.network_store import Snapshot, writable_session
+from submin.storage.network_store import Snapshot, begin_change
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,7 @@ def withdraw(
     if len(named) != 1:
         raise InputError("give exactly one of --block, --image and --control")
     kind, name = named[0]
-    session = writable_session(where)
-    base = Snapshot(zarr.open_group(session.store, mode="r"), where)
+    session, base = begin_change(where)
     ledger = Ledger.of(base)
     table = base.image_columns(["image_id", "block_id", "withdrawn"])
     here = table["withdrawn"] == 0

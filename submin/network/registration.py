@@ -103,7 +103,7 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
 
     every = np.ones(len(rays), dtype=np.bool_)
     origin = intersect(images, sorted_rays(point.astype(np.int32), local, rays.observed, rays.sigma, every), len(ids)).geocentric
-    reached = np.isfinite(origin).all(axis=1)
+    reached: Flags = np.asarray(np.isfinite(origin).all(axis=1))
     at = np.full(len(ids), -1, dtype=np.int64)
     outside: Flags = np.zeros(len(ids), dtype=np.bool_)
     geodetic = geocentric_to_geodetic(origin[reached], cover.ellipsoid)

@@ -271,6 +271,9 @@ def commit(session: icechunk.Session, version: int, message: str) -> None:
         ) from None
 
 
-def writable_session(place: str) -> icechunk.Session:
-    """A session in which to write the next version."""
-    return _open_repository(place).writable_session(BRANCH)
+def begin_change(place: str) -> tuple[icechunk.Session, Snapshot]:
+    """A session in which to write the next version, and the version that it starts from, which what is written does not change."""
+    repository = _open_repository(place)
+    session = repository.writable_session(BRANCH)
+    base = repository.readonly_session(snapshot_id=session.snapshot_id)
+    return session, Snapshot(zarr.open_group(base.store, mode="r"), place)
