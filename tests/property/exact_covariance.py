@@ -128,7 +128,7 @@ def a_priori_factor(images: Sequence[NetworkImage]) -> Array:
 
     A released image has a hundred times the sigmas, and no correlation with its block (docs/decisions/004-blunders-and-bad-cameras.md).
     """
-    m, p = len(images), sensor_named("rpc").parameters
+    m, p = len(images), len(sensor_named("rpc").parameters)
     bias = np.isin(np.arange(p), sensor_named("rpc").bias)
     models = [json.loads(image.a_priori) for image in images]
     passes = list(dict.fromkeys(image.pass_id for image in images))
