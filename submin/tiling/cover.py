@@ -215,6 +215,14 @@ class Cover:
         """Side of a tile's core, metres."""
         return float(self.core / 2 ** self._address(int(tile))[0])
 
+    def _is_tile(self, tile: int) -> bool:
+        whole = tile
+        while whole >= self._base:
+            whole = (whole - self._base) // 4
+            if whole not in self.splits:
+                return False
+        return whole >= 0 and tile not in self.splits
+
     def can_split(self, tile: int) -> bool:
         """True when the quarters of a core are still as wide as the overlap."""
         level = self._address(int(tile))[0]
@@ -229,8 +237,10 @@ class Cover:
             When the tile is none of the cover, or its quarters would be narrower than the overlap.
         """
         tile, cover = int(tile), self
-        if tile in self.splits or not self.can_split(tile):
-            raise InputError(f"tile {self.tile_name(tile)} cannot be split: its quarters would be narrower than the overlap")
+        if not self._is_tile(tile):
+            raise InputError(f"tile is {tile}, which is none of the cover; expected one of its {self.tile_count} tiles")
+        if not self.can_split(tile):
+            raise InputError(f"tile {self.tile_name(tile)} cannot be split: its quarters would be narrower than the overlap, or too many")
         level = self._address(tile)[0]
         while larger := [t for t in cover.neighbours(tile) if cover._address(t)[0] < level]:
             cover = cover.split(larger[0])

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,8 @@ class Information:
 
 def equations(network: Network) -> Equations:
     """The linear problem of a network, from the rays, linearisation and images that it keeps."""
-    images = network.snapshot.images()
+    withdrawn = network.snapshot.image_columns(["withdrawn"])["withdrawn"]
+    images = [replace(i, a_priori="") if w else i for i, w in zip(network.snapshot.images(), withdrawn, strict=True)]
     ellipsoid = network.snapshot.metadata.ellipsoid
     factor = a_priori_factor(images)
     p = factor.shape[0] // len(images)
@@ -138,7 +139,7 @@ def a_priori_factor(images: Sequence[NetworkImage]) -> Array:
     """K (m p, q), dense: own parts of the images of a block by a Cholesky factor of their correlation, then two columns a pass.
 
     A released image has a hundred times the sigmas, and no correlation with its block (docs/decisions/004-blunders-and-bad-cameras.md).
-    A survey has nothing to adjust: its rows are zero.
+    A survey has nothing to adjust, and a withdrawn image is not there: their rows are zero.
     """
     m, p = len(images), len(sensor_named("rpc").parameters)
     bias = np.isin(np.arange(p), sensor_named("rpc").bias)

@@ -327,7 +327,6 @@ def test_too_narrow_quarters_and_split_tiles_are_refused(cover: Cover) -> None:
             cover.split(tile)
 
 
-@pytest.mark.xfail(strict=True, reason="Cover.split does not look whether the tile is one of the cover, as its docstring says")
 @pytest.mark.parametrize("tile", [-1, 9, 9 + 4 * 4 + 1, 9 + 4 * (9 + 4 * 4)])
 def test_what_is_no_tile_of_the_cover_cannot_be_split(tile: int) -> None:
     cover = Cover((10.0, 50.0), (0.0, 0.0), 3, 3, 1000.0, 100.0).split(8)
