@@ -17,7 +17,7 @@ from orchestration.tasks import FlaggedImage
 from submin.errors import InputError
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, defects
-from submin.storage.network_store import Snapshot
+from submin.storage.network_store import Snapshot, writing
 
 DEFAULT_BATCH_BLOCKS = 500
 
@@ -117,6 +117,8 @@ def run(
     ------
     InputError
         When the catalogue breaks its contract, or its frame is not the network's: found before anything is written.
+    StoreError
+        When a batch cannot be written; the network is then as it was after the batch before.
     """
     started = time.monotonic()
     reporter = reporter or Silent()
@@ -129,7 +131,8 @@ def run(
     while batch := list(islice(blocks, max(batch_blocks, 1))):
         good = [block for block, reason in batch if reason is None]
         refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-        tally.add(fuse_batch(place, good, refused, executor, reporter))
+        with writing(place):
+            tally.add(fuse_batch(place, good, refused, executor, reporter))
         reporter.fused(len(batch))
 
     after = Snapshot.open(place)

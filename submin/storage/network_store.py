@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -58,12 +60,20 @@ def _storage(place: str) -> icechunk.Storage:
 
 
 def _open_repository(place: str) -> icechunk.Repository:
+    if "://" not in place and Path(place).is_file():
+        raise StoreError(f"{place}: is a file; expected the folder of a network: make one with 'submin create'")
     if "://" not in place and not Path(place).is_dir():
         raise StoreError(f"{place}: no such network; make one with 'submin create'")
     try:
         return icechunk.Repository.open(_storage(place))
     except icechunk.IcechunkError as error:
-        raise StoreError(f"{place}: not a network ({str(error).strip().splitlines()[0]}); make one with 'submin create'") from None
+        raise StoreError(f"{place}: not a network ({_reason(error)}); make one with 'submin create'") from None
+
+
+def _reason(error: Exception) -> str:
+    """The innermost cause: Icechunk tells causes a line each, from the outside in."""
+    lines = [line.strip(" │├╰─|`->") for line in str(error).splitlines()]
+    return next((line for line in reversed(lines) if line), type(error).__name__)
 
 
 def create_network(place: str, metadata: NetworkMetadata) -> Version:
@@ -90,7 +100,9 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
         create_table(root, "flags", FLAG_COLUMNS)
         session.commit("created", metadata={"version": 0})
     except (icechunk.IcechunkError, OSError) as error:
-        raise StoreError(f"{place}: cannot be written ({str(error).strip().splitlines()[0]})") from error
+        if "://" not in place:  # what was there before was nothing, or an empty folder
+            shutil.rmtree(place, ignore_errors=True)
+        raise StoreError(f"{place}: cannot be written ({_reason(error)}); choose another place, or make room there") from error
     return versions(place)[0]
 
 
@@ -232,6 +244,24 @@ def commit(session: icechunk.Session, version: int, message: str) -> None:
         raise ConflictError(
             "another run committed to this network meanwhile; nothing of this batch was written: give the same command again"
         ) from None
+
+
+@contextmanager
+def writing(place: str) -> Iterator[None]:
+    """Say in one line that a batch could not be written: a full disk, a folder without permission, a store that is gone.
+
+    Raises
+    ------
+    StoreError
+        In place of what the store raised; nothing of the batch is in the network then.
+    """
+    try:
+        yield
+    except (icechunk.IcechunkError, OSError) as error:
+        raise StoreError(
+            f"{place}: cannot be written ({_reason(error)}); nothing of this batch is in the network: "
+            "make room or mend the permissions, and give the same command again"
+        ) from error
 
 
 def writable_session(place: str) -> icechunk.Session:
