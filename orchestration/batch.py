@@ -27,11 +27,13 @@ from orchestration.tasks import (
     report_of,
     update_tile,
 )
+from submin.geodesy import geocentric_to_geodetic
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import SAME_POINT_METRES, ArrivingRays, Registration, register
 from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
 from submin.storage.catalogue_schema import Block
 from submin.storage.network_store import Snapshot, commit, writable_session
+from submin.tiling.cover import Cover
 
 BLOCKS_A_TASK = 8
 
@@ -137,20 +139,22 @@ def _register(
         registration = register(
             rays, image_set([*base.images(old), *images], base.metadata.ellipsoid, base.metadata.parameters), rows, known, cells, base.cover
         )  # fmt: skip
-        bad = _misplaced(blocks, rays, registration)
+        bad = _misplaced(blocks, rays, registration, base.cover)
         if not bad:
             return blocks, images, registration
         refused.extend(Rejected(blocks[k].block_id, reason) for k, reason in bad.items())
         blocks = [block for k, block in enumerate(blocks) if k not in bad]
 
 
-def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Registration) -> dict[int, str]:
+def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Registration, cover: Cover) -> dict[int, str]:
     """Blocks of the batch that cannot be registered, with the reason."""
     bad: dict[int, str] = {}
     inside = np.bincount(rays.block[~registration.outside], minlength=len(blocks))
     for empty in np.flatnonzero(inside == 0):
         bad[int(empty)] = (
-            "the block lies wholly outside the area of the network; check the axis order, or create a network whose area holds it"
+            "the block lies wholly outside the area of the network; longitude and latitude look swapped, in the area or in the block's cameras"
+            if _inside_when_swapped(rays.point_ids[rays.block == empty], registration, cover)
+            else "the block lies wholly outside the area of the network; create a network whose area holds it"
         )
     far = np.flatnonzero(registration.misfit > SAME_POINT_METRES)
     if len(far):
@@ -163,6 +167,14 @@ def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Regist
             "one id must be one place: use other point ids (imports prefix them unless --shared-ids)",
         )
     return bad
+
+
+def _inside_when_swapped(ids: NDArray[np.str_], registration: Registration, cover: Cover) -> bool:
+    """True when most of some points outside the area would be inside it, were their longitudes latitudes."""
+    origin = np.concatenate([a.origin[np.isin(a.point_ids, ids)] for a in registration.arrivals.values()])
+    geodetic = geocentric_to_geodetic(origin, cover.ellipsoid)
+    possible = np.abs(geodetic[:, 0]) <= 90.0
+    return bool(np.mean(possible & ~cover.outside(geodetic[:, 1], np.where(possible, geodetic[:, 0], 0.0))) > 0.5)
 
 
 def _fuse(

@@ -29,8 +29,8 @@ app.add_typer(simulate_app, name="simulate")
 out = Console(highlight=False)
 
 MOST_WORKERS = 1024
-USAGE_ERROR = typer.BadParameter.__mro__[1]
-"""Base of what the parser raises; newer releases of typer keep it in a private package."""
+USAGE_ERROR: type[typer.BadParameter] = typer.BadParameter.__mro__[1]
+"""Base of all that the parser raises; newer releases of typer keep it in a private package."""
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 Box = Annotated[
@@ -361,7 +361,9 @@ def main() -> None:
 
 def _message(error: Exception) -> str:
     if isinstance(error, OSError):
-        return f"{error.filename}: cannot be read or written ({error.strerror or error}); check the path, its permissions and the free space"
+        return (
+            f"{error.filename}: cannot be read or written ({error.strerror or error}); check the path, its permissions and the free space"
+        )
     if isinstance(error, USAGE_ERROR):
         context, said = getattr(error, "ctx", None), str(error.format_message()).rstrip(".")
         return f"{said}; see '{context.command_path if context else 'submin'} --help'" if said else ""

@@ -12,9 +12,9 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
-from submin.sensors import WIDEST
+from submin.sensors import WIDEST, sensor_named
 from submin.storage.catalogue import Catalogue
-from submin.storage.catalogue_schema import CatalogueMetadata
+from submin.storage.catalogue_schema import CatalogueMetadata, ImageRecord
 from submin.storage.network_store import create_network
 from submin.storage.schema import NetworkMetadata
 from submin.tiling.cover import Cover, cover_area
@@ -98,9 +98,12 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     Raises
     ------
     InputError
-        When no image has a footprint.
+        When no image has a footprint, or one is not where its camera looks.
     """
-    footprints = [shapely.from_wkb(image.footprint) for image in catalogue.images if image.footprint]
+    footprints = []
+    for row, image in enumerate(catalogue.images, start=1):
+        if image.footprint:
+            footprints.append(_footprint(image, f"{catalogue.path}: images: row {row}: geometry of image {image.image_id}"))
     if not footprints:
         raise InputError(f"{catalogue.path}: no image has a footprint (column geometry); give the area by --bbox or --aoi")
     west, south, east, north = shapely.total_bounds(footprints)
@@ -108,3 +111,32 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     metres_per_degree = np.radians(1.0) * catalogue.metadata.semimajor_axis
     width = float(np.median((bounds[:, 3] - bounds[:, 1]) * metres_per_degree)) / 1000.0
     return shapely.box(west, south, east, north), CORE_IN_FOOTPRINTS * width, width
+
+
+def _footprint(image: ImageRecord, name: str) -> BaseGeometry:
+    """The footprint of an image, on the globe and not with its axes swapped."""
+    try:
+        footprint = shapely.from_wkb(image.footprint)
+    except shapely.GEOSException as error:
+        raise InputError(f"{name} is not WKB ({error}); expected a polygon in longitude and latitude") from None
+    if footprint.is_empty:
+        raise InputError(f"{name} is empty; expected a polygon in longitude and latitude")
+    west, south, east, north = footprint.bounds
+    longitude, latitude = _centre_on_ground(image)
+    x, y = 0.5 * (west + east), 0.5 * (south + north)
+    swapped = np.hypot(x - latitude, y - longitude) < 0.1 * np.hypot((x - longitude + 180.0) % 360.0 - 180.0, y - latitude)
+    if swapped or not (-90.0 <= south <= north <= 90.0 and -360.0 <= west <= east <= 360.0):
+        raise InputError(
+            f"{name} spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, but its camera looks at longitude "
+            f"{longitude:g}, latitude {latitude:g}; "
+            + ("its axes look swapped: expected longitude first, then latitude" if swapped else "expected degrees on a globe")
+        )
+    return footprint
+
+
+def _centre_on_ground(image: ImageRecord) -> tuple[float, float]:
+    """Longitude and latitude of the middle of an image, at its camera's mean height."""
+    sensor, camera = sensor_named(image.sensor), image.pack()[None]
+    sample, line = np.array([0.5 * image.width]), np.array([0.5 * image.height])
+    at = sensor.localise(camera, np.zeros(1, dtype=np.int32), sample, line, sensor.mean_height(camera))[0]
+    return float(at[0]), float(at[1])

@@ -90,6 +90,8 @@ class Catalogue:
             When metadata, images or priors cannot be used: file, row, value, what was expected.
         """
         folder = Path(path)
+        if folder.is_file():
+            raise CatalogueError(f"{folder}: is a file; expected a catalogue (a folder with catalogue.json)")
         if not folder.is_dir():
             raise CatalogueError(f"{folder}: no such folder; expected a catalogue (a folder with catalogue.json)")
         metadata = _from_json(folder / "catalogue.json", CatalogueMetadata.from_mapping)
@@ -177,6 +179,8 @@ class Catalogue:
                 raise CatalogueError(f"{path}: row {row}: {error}") from None
         path = required_path(self.path, "measurements")
         rays = sum(len(self._image_index(block_id, row, table, path)) for block_id, row, table in _runs(path))
+        if not rays:
+            raise CatalogueError(f"{path}: holds no measurements; expected at least one row")
         for kind in _COVARIANCE_OF:
             self.points(kind)
         return CatalogueSummary(self.block_count, len(self.images), rays)

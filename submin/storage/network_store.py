@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import icechunk
 import numpy as np
@@ -72,6 +73,8 @@ def _open_repository(place: str) -> icechunk.Repository:
 
 def _reason(error: Exception) -> str:
     """The innermost cause: Icechunk tells causes a line each, from the outside in."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
     lines = [line.strip(" │├╰─|`->") for line in str(error).splitlines()]
     return next((line for line in reversed(lines) if line), type(error).__name__)
 
@@ -86,11 +89,13 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
     """
     if "://" not in place and Path(place).exists() and (not Path(place).is_dir() or any(Path(place).iterdir())):
         raise StoreError(f"{place}: already exists; choose another place, or remove it first")
+    remote = "://" in place
+    # a folder is made beside the one that is meant and takes its name when all is written
+    making = place if remote else str(Path(place).absolute().with_name(f".{Path(place).name}.{uuid4().hex}"))
     try:
-        if "://" not in place:  # Icechunk panics where it cannot make the folder
-            Path(place).mkdir(parents=True, exist_ok=True)
-        repository = icechunk.Repository.create(_storage(place))
-        session = repository.writable_session(BRANCH)
+        if not remote:  # Icechunk panics where it cannot make the folder
+            Path(making).mkdir(parents=True)
+        session = icechunk.Repository.create(_storage(making)).writable_session(BRANCH)
         root = zarr.create_group(session.store, attributes=metadata.to_attributes() | {"version": 0})
         root.create_group("cells")
         root.create_group("tiles")
@@ -99,10 +104,13 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
         create_table(root, "directory", DIRECTORY_COLUMNS)
         create_table(root, "flags", FLAG_COLUMNS)
         session.commit("created", metadata={"version": 0})
+        if not remote:
+            Path(making).rename(place)
     except (icechunk.IcechunkError, OSError) as error:
-        if "://" not in place:  # what was there before was nothing, or an empty folder
-            shutil.rmtree(place, ignore_errors=True)
         raise StoreError(f"{place}: cannot be written ({_reason(error)}); choose another place, or make room there") from error
+    finally:
+        if not remote:
+            shutil.rmtree(making, ignore_errors=True)
     return versions(place)[0]
 
 

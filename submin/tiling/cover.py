@@ -274,8 +274,7 @@ def cover_area(area: BaseGeometry, core: float, overlap: float, ellipsoid: Ellip
             "the area reaches to the point opposite its middle, where no equal-area plane reaches; take less than a hemisphere"
         )
     # A touch of tolerance: an area of exactly three cores is three cores, not four.
-    columns = max(int(np.ceil((x.max() - x.min()) / core - 1e-3)), 1)
-    rows = max(int(np.ceil((y.max() - y.min()) / core - 1e-3)), 1)
+    columns, rows = (max(int(np.ceil(min(np.ptp(v) / core, 1e12) - 1e-3)), 1) for v in (x, y))
     origin = (0.5 * (x.max() + x.min()) - 0.5 * columns * core, 0.5 * (y.max() + y.min()) - 0.5 * rows * core)
     return Cover(centre, origin, rows, columns, core, overlap, ellipsoid)
 

@@ -145,7 +145,7 @@ def test_what_is_not_a_network_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere: no such network; make one with 'submin create'"):
         Snapshot.open(str(tmp_path / "nowhere"))
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(StoreError, match="file: no such network"):
+    with pytest.raises(StoreError, match="file: is a file; expected the folder of a network"):
         Snapshot.open(str(tmp_path / "file"))
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "letter").write_text("mine")
