@@ -152,7 +152,7 @@ def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Regist
     inside = np.bincount(rays.block[~registration.outside], minlength=len(blocks))
     for empty in np.flatnonzero(inside == 0):
         bad[int(empty)] = (
-            "the block lies wholly outside the area of the network; longitude and latitude look swapped, in the area or in the block's cameras"
+            "the block lies wholly outside the area of the network; longitude and latitude look swapped, in the area or in its cameras"
             if _inside_when_swapped(rays.point_ids[rays.block == empty], registration, cover)
             else "the block lies wholly outside the area of the network; create a network whose area holds it"
         )
@@ -171,10 +171,11 @@ def _misplaced(blocks: Sequence[Block], rays: ArrivingRays, registration: Regist
 
 def _inside_when_swapped(ids: NDArray[np.str_], registration: Registration, cover: Cover) -> bool:
     """True when most of some points outside the area would be inside it, were their longitudes latitudes."""
-    origin = np.concatenate([a.origin[np.isin(a.point_ids, ids)] for a in registration.arrivals.values()])
+    origin = np.concatenate([np.empty((0, 3)), *(a.origin[np.isin(a.point_ids, ids)] for a in registration.arrivals.values())])
     geodetic = geocentric_to_geodetic(origin, cover.ellipsoid)
     possible = np.abs(geodetic[:, 0]) <= 90.0
-    return bool(np.mean(possible & ~cover.outside(geodetic[:, 1], np.where(possible, geodetic[:, 0], 0.0))) > 0.5)
+    inside = possible & ~cover.outside(geodetic[:, 1], np.where(possible, geodetic[:, 0], 0.0))
+    return 2 * int(inside.sum()) > len(inside)
 
 
 def _fuse(

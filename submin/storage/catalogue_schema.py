@@ -313,7 +313,8 @@ def defects(block: Block) -> str | None:
     if (counts == 0).any():
         return f"image {block.images[int(np.argmin(counts))].image_id} has no measurements; expected some in every image of the block"
     if len(block) < LEAST_RAYS:
-        return f"the block has {len(block)} ray{'s' * (len(block) > 1)}; expected at least {LEAST_RAYS}: measure more, or join it to another block"
+        found = f"{len(block)} ray{'s' * (len(block) > 1)}"
+        return f"the block has {found}; expected at least {LEAST_RAYS}: measure more, or join it to another block"
     if block.a_priori.correlation in ("exponential", "gaussian"):
         for image in block.images:
             if not image.acquired:
