@@ -12,12 +12,13 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
+from submin.formats.columns import required_path
 from submin.sensors import WIDEST, sensor_named
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata, ImageRecord
 from submin.storage.network_store import create_network
 from submin.storage.schema import NetworkMetadata
-from submin.tiling.cover import Cover, cover_area
+from submin.tiling.cover import Cover, check_on_globe, cover_area
 
 DEFAULT_CORE_KM = 100.0
 CORE_IN_FOOTPRINTS = 4.0
@@ -72,7 +73,7 @@ def read_area(path: Path) -> BaseGeometry:
     Raises
     ------
     InputError
-        When the file is not GeoJSON or holds no polygon.
+        When the file is not GeoJSON, holds no polygon, or one that is not on a globe or crosses itself.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -89,7 +90,12 @@ def read_area(path: Path) -> BaseGeometry:
     broken = [polygon for polygon in polygons if not polygon.is_valid]
     if broken:
         raise InputError(f"{path}: the area is not a valid polygon: {shapely.is_valid_reason(broken[0])}; mend it and try again")
-    return shapely.union_all(polygons)
+    whole = shapely.union_all(polygons)
+    try:
+        check_on_globe(whole)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return whole
 
 
 def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
@@ -100,10 +106,10 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     InputError
         When no image has a footprint, or one is not where its camera looks.
     """
-    footprints = []
+    footprints, path = [], required_path(catalogue.path, "images")
     for row, image in enumerate(catalogue.images, start=1):
         if image.footprint:
-            footprints.append(_footprint(image, f"{catalogue.path}: images: row {row}: geometry of image {image.image_id}"))
+            footprints.append(_footprint(image, f"{path}: row {row}: geometry of image {image.image_id}"))
     if not footprints:
         raise InputError(f"{catalogue.path}: no image has a footprint (column geometry); give the area by --bbox or --aoi")
     west, south, east, north = shapely.total_bounds(footprints)

@@ -246,7 +246,7 @@ def _from_json(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
     except FileNotFoundError:
         raise CatalogueError(f"{path}: no such file; expected the metadata of a catalogue") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CatalogueError(f"{path}: is not JSON ({error})") from None
+        raise CatalogueError(f"{path}: is not JSON ({error}); expected a JSON object in UTF-8") from None
     except InputError as error:
         raise CatalogueError(f"{path}: {error}") from None
 

@@ -107,7 +107,9 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
         if not remote:
             Path(making).rename(place)
     except (icechunk.IcechunkError, OSError) as error:
-        raise StoreError(f"{place}: cannot be written ({_reason(error)}); choose another place, or make room there") from error
+        raise StoreError(
+            f"{place}: cannot be written ({_reason(error)}); make room there, mend the permissions, or choose another place"
+        ) from error
     finally:
         if not remote:
             shutil.rmtree(making, ignore_errors=True)

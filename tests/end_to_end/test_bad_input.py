@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import re
@@ -13,27 +12,28 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import icechunk
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv as pcsv
 import pyarrow.parquet as pq
 import pytest
+import shapely
 import zarr
-from networks import area_of
+from networks import accepted_rays, area_of
 
 from orchestration.cli import main
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.run import run
-from submin.adjustment.priors import APriori
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import versions
+from submin.storage.network_store import Snapshot, versions
 from submin.storage.simulated import write_region
 
 ROOT = Path(__file__).parents[2]
@@ -53,8 +53,7 @@ class Row:
     message: str
 
     def says(self, message: str) -> bool:
-        parts = [re.escape(part) for part in self.message.split("…")]
-        return re.fullmatch(".+".join(parts) if self.message[:1] != "…" else ".*" + ".+".join(parts[1:]), message) is not None
+        return re.fullmatch(".+".join(re.escape(part) for part in self.message.split("…")), message) is not None
 
 
 def documented() -> dict[str, Row]:
@@ -78,8 +77,9 @@ class World:
     folder: Path
     origin: Path
     around: Callable[[], AbstractContextManager[None]] = nullcontext
+    """In what the command runs: a full disk, a folder that is read only."""
     rejected: tuple[str, ...] = ()
-    before: list[list[Any]] = field(default_factory=list)
+    """Blocks that must be named; all others must come in."""
     leaves_chunks: bool = False
     """A failed commit may leave data that no version names."""
 
@@ -317,11 +317,23 @@ simply("box without width", lambda w: ["create", w.new, "--bbox", 99, 34, 99, 36
 simply("box with swapped axes", lambda w: ["create", w.new, "--bbox", 34, 99, 36, 101])
 simply("queried box with swapped axes", lambda w: ["query", w.fused, "--bbox", 34, 99, 36, 101])
 simply("box that is not finite", lambda w: ["create", w.new, "--bbox", "nan", 34, 101, 36])
+
+
+@case("queried box whose swapped axes are on the globe")
+def _(w: World) -> list[Any]:
+    create(str(w.new), shapely.box(34.0, 29.0, 36.0, 31.0), Catalogue.open(w.catalogue).metadata, 60.0, 20.0)
+    return ["query", w.new, "--bbox", 29.5, 34.5, 30.5, 35.5]
+
+
 simply("no such area file", lambda w: ["create", w.new, "--aoi", w.folder / "nowhere.geojson"])
 simply("area file that is not JSON", lambda w: ["create", w.new, "--aoi", w.write("area.geojson", "POLYGON ((0 0))")])
-simply("area file that is not UTF-8", lambda w: ["create", w.new, "--aoi", w.write("area.geojson", b'{"type": "Polygon", "name": "Z\xfcrich"}')])
+simply(
+    "area file that is not UTF-8",
+    lambda w: ["create", w.new, "--aoi", w.write("area.geojson", b'{"type": "Polygon", "name": "Z\xfcrich"}')],
+)
 simply("area without a polygon", lambda w: w.area(99, 34, kind="Point"))
 simply("empty area", lambda w: w.area())
+simply("queried area with swapped axes", lambda w: ["query", w.fused, "--aoi", w.area([[y, x] for x, y in RING])[-1]])
 simply("area without extent", lambda w: w.area([[99, 34], [101, 36], [99, 34], [99, 34]]))
 simply("self-crossing area", lambda w: w.area([[99, 34], [101, 36], [101, 34], [99, 36], [99, 34]]))
 simply("area with swapped axes", lambda w: w.area([[y, x] for x, y in RING]))
@@ -336,8 +348,6 @@ simply("tiles too small to count", lambda w: ["create", w.new, *BOX, "--tile-km"
 
 @case("footprints with swapped axes")
 def _(w: World) -> list[Any]:
-    import shapely
-
     columns = w.columns("images")
     flipped = shapely.transform(shapely.from_wkb(columns["geometry"]), lambda at: at[:, ::-1])
     w.put("images", columns | {"geometry": shapely.to_wkb(flipped).tolist()})
@@ -366,7 +376,7 @@ def changed(name: str, change: Callable[[World], Any]) -> None:
 
     def words(w: World) -> list[Any]:
         change(w)
-        return w.run()
+        return [*w.run(), "--batch-blocks", 1]  # were the first block committed before the last row is read, it would show
 
     case(name)(words)
 
@@ -387,16 +397,23 @@ changed("another body", lambda w: w.metadata(body="moon", semimajor_axis=1737400
 
 changed("table missing", lambda w: (w.catalogue / "measurements.parquet").unlink())
 changed("table there twice", lambda w: (w.catalogue / "measurements.csv").write_text("mine"))
-changed("missing column of measurements", lambda w: w.put("measurements", {k: v for k, v in w.columns("measurements").items() if k != "line"}))
+changed(
+    "missing column of measurements", lambda w: w.put("measurements", {k: v for k, v in w.columns("measurements").items() if k != "line"})
+)
 changed("missing column of images", lambda w: w.put("images", {k: v for k, v in w.columns("images").items() if k != "camera"}))
 changed("column of another type", lambda w: w.put("measurements", w.columns("measurements") | {"sample": ["here"] * 300}))
 changed("empty id", lambda w: w.set("measurements", "point_id", "", row=4))
 changed("unknown image in a measurement", lambda w: w.set("measurements", "image_id", "T9", row=4))
 changed("image of another block in a measurement", lambda w: w.set("measurements", "image_id", w.columns("images")["image_id"][-1], row=4))
 changed("unknown block in a measurement", lambda w: w.set("measurements", "block_id", "T9", row=299))
-changed("measurements not sorted by block", lambda w: w.set("measurements", "block_id", w.block(3), row=0))
+changed(
+    "measurements not sorted by block", lambda w: w.put("measurements", {k: [*v[1:], v[0]] for k, v in w.columns("measurements").items()})
+)
 changed("no measurements in the file", lambda w: w.rows("measurements", lambda row: False))
-changed("truncated Parquet", lambda w: (w.catalogue / "measurements.parquet").write_bytes((w.catalogue / "measurements.parquet").read_bytes()[:2000]))
+changed(
+    "truncated Parquet",
+    lambda w: (w.catalogue / "measurements.parquet").write_bytes((w.catalogue / "measurements.parquet").read_bytes()[:2000]),
+)
 changed("Parquet of no bytes", lambda w: (w.catalogue / "measurements.parquet").write_bytes(b""))
 
 
@@ -449,7 +466,9 @@ changed("unknown key in a block's prior", lambda w: w.priors({"default": {"bias_
 changed("prior of an unknown block", lambda w: w.priors({"blocks": {"T9": {}}}))
 changed("prior without a number", lambda w: w.priors({"default": {"bias_px": "large"}}))
 changed("prior sigma that is not positive", lambda w: w.priors({"default": {"bias_px": 0}}))
-changed("prior covariance that is not positive definite", lambda w: w.priors({"default": {"correlation": "fixed", "correlation_parameter": 1}}))
+changed(
+    "prior covariance that is not positive definite", lambda w: w.priors({"default": {"correlation": "fixed", "correlation_parameter": 1}})
+)
 changed("prior part out of range", lambda w: w.priors({"default": {"common_to_pass": 1.5}}))
 changed("unknown correlation of the priors", lambda w: w.priors({"default": {"correlation": "linear"}}))
 
@@ -532,11 +551,9 @@ def _(w: World) -> list[Any]:
     w.rows("images", lambda row: row["block_id"] in (w.block(0), w.block(1)))
     kept = set(Catalogue.open(catalogue).block_ids)
     w.rows("measurements", lambda row: row["block_id"] in kept)
-    shutil.rmtree(w.network)
-    create(str(w.network), __import__("shapely").box(34.0, 29.0, 36.0, 31.0), Catalogue.open(catalogue).metadata, 60.0, 20.0)
-    words = w.run()
+    create(str(w.new), shapely.box(34.0, 29.0, 36.0, 31.0), Catalogue.open(catalogue).metadata, 60.0, 20.0)
     w.rejected = tuple(sorted(kept))
-    return words
+    return ["run", catalogue, w.new]
 
 
 @case("one id at two places")
@@ -555,6 +572,16 @@ def _(w: World) -> list[Any]:
 def _(w: World) -> list[Any]:
     w.camera(lambda c: c.update(SAMP_NUM_COEFF=[0.0] * 20))
     return w.run(rejected=w.block(0))
+
+
+@case("block whose adjustment does not converge")
+def _(w: World) -> list[Any]:
+    block = w.block(0)
+    rays = w.columns("measurements")
+    for name in ("sample", "line"):  # every point in the middle of every image
+        rays[name] = [5000.0 if b == block else v for v, b in zip(rays[name], rays["block_id"], strict=True)]
+    w.put("measurements", rays)
+    return w.run(rejected=block)
 
 
 @case("block known with other content")
@@ -578,6 +605,7 @@ def _(w: World) -> list[Any]:
 
 simply("nothing queried", lambda w: ["query", w.fused])
 simply("two things queried", lambda w: ["query", w.fused, *BOX, "--points", w.write("ids.txt", "P1")])
+simply("scheduler that does not answer", lambda w: [*w.run(), "--scheduler", "carrier-pigeon://here"])
 simply("unknown policy", lambda w: ["query", w.fused, *BOX, "--policy", "best"])
 simply("unknown tile", lambda w: ["query", w.fused, "--tile", "r9"])
 simply("unknown points", lambda w: ["query", w.fused, "--points", w.write("ids.txt", "P1\nP2\n")])
@@ -589,7 +617,14 @@ simply("output of unknown format", lambda w: ["query", w.fused, *BOX, "--out", w
 simply("output to a folder that does not exist", lambda w: ["query", w.fused, *BOX, "--out", w.folder / "nowhere" / "control.csv"])
 simply("output where a folder is", lambda w: ["query", w.fused, *BOX, "--out", Path(f"{w.catalogue}").rename(w.folder / "c.csv")])
 simply("check of no such table", lambda w: ["check", w.fused, w.folder / "nowhere.csv"])
-simply("check of points that are not in the network", lambda w: ["check", w.fused, w.write("c.csv", f"{','.join(POINT | SIGMAS)}\nZ,100,35,900,1,1,1\n")])
+simply(
+    "check of points that are not in the network",
+    lambda w: ["check", w.fused, w.write("c.csv", f"{','.join(POINT | SIGMAS)}\nZ,100,35,900,1,1,1\n")],
+)
+simply(
+    "report of a check to a folder that does not exist",
+    lambda w: ["check", w.fused, w.catalogue / "check.parquet", "--out", w.new / "c.txt"],
+)
 simply("map of another format", lambda w: ["map", w.fused, "--out", w.folder / "map.pdf"])
 simply("map to a folder that does not exist", lambda w: ["map", w.fused, "--out", w.folder / "nowhere" / "map.png"])
 
@@ -629,12 +664,15 @@ def imported(name: str, change: Callable[[World], Any]) -> None:
 
 simply("imported RPC without a list of coefficients", lambda w: w.rpc(lambda c: c.pop("SAMP_DEN_COEFF")))
 simply("imported RPC with 19 coefficients", lambda w: w.rpc(lambda c: c["LINE_NUM_COEFF"].pop()))
+simply("imported RPC with swapped axes", lambda w: w.rpc(lambda c: c.update(LAT_OFF=c["LONG_OFF"], LONG_OFF=c["LAT_OFF"])))
 simply("imported RPC with a scale of zero", lambda w: w.rpc(lambda c: c.update(LONG_SCALE=0.0)))
 imported("missing RPC", lambda w: (w.folder / "rpc" / f"{w.columns('images')['image_id'][0]}.json").unlink())
 imported("RPC file that is none", lambda w: w.write(f"rpc/{w.columns('images')['image_id'][0]}.json", "mine"))
 imported("missing column of an import", lambda w: w.replace("tracks.csv", "col", "column"))
 imported("unknown image in a track", lambda w: w.replace("tracks.csv", "T000", "T999"))
-imported("ray twice in the tracks", lambda w: w.write("tracks.csv", (t := (w.folder / "tracks.csv").read_text()) + t.splitlines()[1] + "\n"))
+imported(
+    "ray twice in the tracks", lambda w: w.write("tracks.csv", (t := (w.folder / "tracks.csv").read_text()) + t.splitlines()[1] + "\n")
+)
 imported("no such file of tracks", lambda w: (w.folder / "tracks.csv").unlink())
 imported("folder that holds something already", lambda w: shutil.copytree(w.catalogue, w.new))
 imported("file in place of a new catalogue", lambda w: w.write("new", "mine"))
@@ -714,20 +752,111 @@ def test_the_page_and_the_cases_are_the_same() -> None:
     assert sorted(ROWS) == sorted(CASES)
 
 
-def dump(name: str, code: int, message: str) -> None:
-    with open("/tmp/bad_dump.txt", "a") as f:
-        f.write(f"{name}\t{code}\t{message}\n")
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_each_case(name: str, world: World, call: Call) -> None:
-    words = CASES[name](world)
-    before = state(world.folder)
+    words, row = CASES[name](world), ROWS[name]
+    (refused if row.code == 2 else rejected_alone)(world, words, row, call)
+
+
+def refused(world: World, words: list[Any], row: Row, call: Call) -> None:
+    """Exit code 2, one line on standard error, and nothing written."""
+    network = world.folder / "network"
+    before, known = state(world.folder), len(versions(str(network))) if network.exists() else 0
     with world.around():
         code, out, err = call(*words)
-    if code == 2:
-        dump(name, code, err.strip())
-        print(state(world.folder) == before, json.loads(call(*words, "--json")[1])["error"])
-        assert world.leaves_chunks or state(world.folder) == before
+        as_json = call(*words, "--json")
+    assert (code, out) == (2, "")
+    assert err.startswith("submin: ") and err.endswith("\n") and err.count("\n") == 1
+    message = err.removeprefix("submin: ").removesuffix("\n")
+    assert row.says(message), message
+    assert as_json[0] == 2
+    assert row.says(json.loads(as_json[1])["error"])
+    if world.leaves_chunks:
+        assert len(versions(str(network))) == known
     else:
-        dump(name, code, out.strip())
+        assert state(world.folder) == before
+
+
+def rejected_alone(world: World, words: list[Any], row: Row, call: Call) -> None:
+    """Exit code 1, the block named with its reason in JSON and in text, and all other blocks in the network."""
+    network = str(words[2])
+    blocks = set(Catalogue.open(world.catalogue).block_ids)
+    code, out, err = call(*words, "--json")
+    assert (code, err) == (1, "")
+    values = json.loads(out)
+    assert [r["block_id"] for r in values["blocks_rejected"]] == list(world.rejected)
+    for rejected in values["blocks_rejected"]:
+        assert row.says(rejected["reason"]), rejected["reason"]
+    ledger = Snapshot.open(network).ledger(["block_id", "status"])
+    fused = {str(b) for b, s in zip(ledger["block_id"], ledger["status"], strict=True) if s == "fused"}
+    assert blocks - set(world.rejected) <= fused
+    assert values["blocks_fused"] + values["blocks_skipped"] == len(blocks) - len(world.rejected)
+
+    known = len(versions(network))
+    code, out, err = call(*words)
+    assert (code, err) == (1, "")
+    lines = [line for line in out.splitlines() if line.startswith("rejected block ")]
+    assert lines == [f"rejected block {r['block_id']}: {r['reason']}" for r in values["blocks_rejected"]]
+    assert len(versions(network)) == known  # the same again writes nothing
+
+
+def test_a_billion_tiles_are_refused_at_once(world: World, call: Call) -> None:
+    words = CASES["a billion tiles"](world)
+    call(*words)
+    started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert call(*words)[0] == 2
+    assert time.monotonic() - started < 1.0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 10_000  # kB
+
+
+@contextmanager
+def disk(folder: Path) -> Iterator[Callable[[int], AbstractContextManager[None]]]:
+    """A folder on a small file system of its own, and what fills it up to some bytes.
+
+    Where none can be mounted the size of files is limited instead: writes fail in the middle of a commit all the same.
+    """
+    folder.mkdir()
+    mounted = not subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], capture_output=True, check=False).returncode
+
+    @contextmanager
+    def full(room: int) -> Iterator[None]:
+        ballast = folder / "ballast"
+        ballast.write_bytes(bytes(shutil.disk_usage(folder).free - room))
+        try:
+            yield
+        finally:
+            ballast.unlink()
+
+    try:
+        yield full if mounted else limited
+    finally:
+        if mounted:
+            subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@pytest.mark.parametrize("how", ["full file system", "limit of file size"])
+def test_a_full_disk_leaves_the_last_version_and_the_same_command_continues(how: str, world: World, origin: Path, call: Call) -> None:
+    catalogue, first = world.catalogue, Catalogue.open(world.catalogue).block_ids[:2]
+    part = shutil.copytree(catalogue, world.folder / "part")
+    for stem in ("images", "measurements"):
+        table = pq.read_table(part / f"{stem}.parquet")
+        pq.write_table(table.filter(pc.is_in(table["block_id"], pa.array(first))), part / f"{stem}.parquet")
+    with disk(world.folder / "disk") if how == "full file system" else nullcontext(limited) as full:
+        network = (world.folder / "disk" if how == "full file system" else world.folder) / "network"
+        shutil.copytree(origin / "network", network)
+        assert call("run", part, network)[0] == 0
+        query = ("query", network, *BOX, "--policy", "rigorous", "--out", world.folder / "control.npz")
+        assert call(*query)[0] == 0
+        before = np.load(world.folder / "control.npz")["covariance"]
+        for room in (0, 2_000, 20_000):  # the first write fails, or a later one
+            with full(room):
+                code, _, err = call("run", catalogue, network)
+            assert (code, err.count("\n")) == (2, 1)
+            assert ROWS["disk full in the middle of a commit"].says(err.strip().removeprefix("submin: "))
+            assert [v.name for v in versions(str(network))] == ["v1", "v0"]
+            assert call(*query)[0] == 0
+            np.testing.assert_array_equal(np.load(world.folder / "control.npz")["covariance"], before)
+        code, out, _ = call("run", catalogue, network, "--json")
+        assert code == 0
+        assert (json.loads(out)["version"], json.loads(out)["blocks_fused"]) == ("v2", BLOCKS - 2)
+        assert accepted_rays(network) == accepted_rays(origin / "fused")
