@@ -361,7 +361,8 @@ def main() -> None:
 
 def _message(error: Exception) -> str:
     if isinstance(error, OSError):
-        return f"{error.filename}: cannot be read or written ({error.strerror or error}); check path, permissions and free space"
+        name = f"{error.filename}: " if error.filename else ""
+        return f"{name}cannot be read or written ({error.strerror or error}); check path, permissions and free space"
     if isinstance(error, USAGE_ERROR):
         context, said = getattr(error, "ctx", None), str(error.format_message()).rstrip(".")
         return f"{said}; see '{context.command_path if context else 'submin'} --help'" if said else ""

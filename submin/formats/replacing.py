@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
@@ -33,4 +33,5 @@ def replacing(path: str | Path) -> Iterator[Path]:
             f"{target}: cannot be written ({error.strerror or error}); make room there, mend the permissions, or choose another place"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # not there, or in a folder that cannot be written
+            temporary.unlink()

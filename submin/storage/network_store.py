@@ -89,9 +89,10 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
     """
     if "://" not in place and Path(place).exists() and (not Path(place).is_dir() or any(Path(place).iterdir())):
         raise StoreError(f"{place}: already exists; choose another place, or remove it first")
-    remote = "://" in place
-    # a folder is made beside the one that is meant and takes its name when all is written
-    making = place if remote else str(Path(place).absolute().with_name(f".{Path(place).name}.{uuid4().hex}"))
+    remote, folder = "://" in place, Path(place)
+    # made beside the folder that is meant, or in it where it exists (it may be a mount), and moved there when all is written
+    beside = folder if folder.is_dir() else folder.absolute().parent
+    making = place if remote else str(beside / f".{uuid4().hex}")
     try:
         if not remote:  # Icechunk panics where it cannot make the folder
             Path(making).mkdir(parents=True)
@@ -104,8 +105,11 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
         create_table(root, "directory", DIRECTORY_COLUMNS)
         create_table(root, "flags", FLAG_COLUMNS)
         session.commit("created", metadata={"version": 0})
-        if not remote:
-            Path(making).rename(place)
+        if folder.is_dir():
+            for part in sorted(Path(making).iterdir(), key=lambda path: path.name == "refs"):  # which make it a repository
+                part.rename(folder / part.name)
+        elif not remote:
+            Path(making).rename(folder)
     except (icechunk.IcechunkError, OSError) as error:
         raise StoreError(
             f"{place}: cannot be written ({_reason(error)}); make room there, mend the permissions, or choose another place"
@@ -267,7 +271,7 @@ def writing(place: str) -> Iterator[None]:
     """
     try:
         yield
-    except (icechunk.IcechunkError, OSError) as error:
+    except icechunk.IcechunkError as error:
         raise StoreError(
             f"{place}: cannot be written ({_reason(error)}); nothing of this batch is in the network: "
             "make room or mend the permissions, and give the same command again"
