@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from submin.errors import InputError
 from submin.formats.columns import required_path
 from submin.sensors import WIDEST, sensor_named
-from submin.storage.catalogue import Catalogue
+from submin.storage.catalogue import Catalogue, read_footprint
 from submin.storage.catalogue_schema import CatalogueMetadata, ImageRecord
 from submin.storage.network_store import create_network
 from submin.storage.schema import NetworkMetadata
@@ -121,10 +121,7 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
 
 def _footprint(image: ImageRecord, name: str) -> BaseGeometry:
     """The footprint of an image, on the globe and not with its axes swapped."""
-    try:
-        footprint = shapely.from_wkb(image.footprint)
-    except shapely.GEOSException as error:
-        raise InputError(f"{name} is not WKB ({error}); expected a polygon in longitude and latitude") from None
+    footprint = read_footprint(image.footprint, name)
     if footprint.is_empty:
         raise InputError(f"{name} is empty; expected a polygon in longitude and latitude")
     west, south, east, north = footprint.bounds

@@ -16,7 +16,9 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
@@ -177,6 +179,8 @@ class Catalogue:
                 image.pack()
             except InputError as error:
                 raise CatalogueError(f"{path}: row {row}: {error}") from None
+            if image.footprint:
+                read_footprint(image.footprint, f"{path}: row {row}: geometry of image {image.image_id}")
         path = required_path(self.path, "measurements")
         rays = sum(len(self._image_index(block_id, row, table, path)) for block_id, row, table in _runs(path))
         if not rays:
@@ -212,6 +216,14 @@ class Catalogue:
             number_values(table, "sigma_sample", DEFAULT_SIGMA_PX),
             number_values(table, "sigma_line", DEFAULT_SIGMA_PX),
         )
+
+
+def read_footprint(footprint: bytes, name: str) -> BaseGeometry:
+    """The polygon of a footprint that ``name`` names in errors; raises `CatalogueError` when it is not WKB."""
+    try:
+        return shapely.from_wkb(footprint)
+    except shapely.GEOSException as error:
+        raise CatalogueError(f"{name} is not WKB ({error}); expected a polygon in longitude and latitude") from None
 
 
 def _runs(path: Path) -> Iterator[tuple[str, int, pa.Table]]:
@@ -291,5 +303,5 @@ def _read_images(path: Path) -> tuple[ImageRecord, ...]:
 
 __all__ = [
     "IMAGE_COLUMNS", "MEASUREMENT_COLUMNS",
-    "Block", "Catalogue", "CatalogueMetadata", "CatalogueSummary", "ImageRecord", "PointTable", "defects",
+    "Block", "Catalogue", "CatalogueMetadata", "CatalogueSummary", "ImageRecord", "PointTable", "defects", "read_footprint",
 ]  # fmt: skip

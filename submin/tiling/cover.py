@@ -279,8 +279,8 @@ def check_on_globe(area: BaseGeometry) -> None:
     if not (-90.0 <= south <= north <= 90.0 and -360.0 <= west <= east <= 360.0):
         swapped = -90.0 <= west <= east <= 90.0
         raise InputError(
-            f"the area spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, which is not on a globe; "
-            + ("its axes look swapped: expected longitude first, then latitude" if swapped else "expected degrees, longitude first")
+            f"the area spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, which is not on a globe"
+            + ("; its axes look swapped: expected longitude first, then latitude" if swapped else "")
         )
 
 

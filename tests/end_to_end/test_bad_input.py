@@ -31,6 +31,7 @@ from orchestration.cli import main
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.run import run
+from submin.adjustment.warm_up import compile_kernels
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.network_store import Snapshot, versions
@@ -475,6 +476,7 @@ def _(w: World) -> list[Any]:
 changed("image there twice", lambda w: w.set("images", "image_id", w.columns("images")["image_id"][0], row=2))
 changed("image without size", lambda w: w.set("images", "width", 0))
 changed("time that is none", lambda w: w.set("images", "acquired", "noon"))
+changed("geometry that is not WKB", lambda w: w.set("images", "geometry", b"polygon", row=1))
 changed("unknown sensor", lambda w: w.set("images", "sensor", "sonar"))
 changed("camera that is not JSON", lambda w: w.set("images", "camera", "<rpc/>"))
 changed("RPC without a list of coefficients", lambda w: w.camera(lambda c: c.pop("SAMP_DEN_COEFF")))
@@ -591,6 +593,20 @@ def _(w: World) -> list[Any]:
     rays["point_id"] = [far if b == block and p == mine else p for p, b in zip(rays["point_id"], rays["block_id"], strict=True)]
     w.put("measurements", rays)
     return w.run(rejected=block)
+
+
+@case("one id at another place than in the network")
+def _(w: World) -> list[Any]:
+    block = w.block(0)
+    all_cameras(w, block, lambda c: c.update(LONG_OFF=c["LONG_OFF"] + 0.2))
+    for stem in ("images", "measurements"):
+        columns = w.columns(stem)
+        moved = [b == block for b in columns["block_id"]]
+        for name in ("block_id", "image_id"):
+            columns[name] = [f"again-{value}" if m else value for value, m in zip(columns[name], moved, strict=True)]
+        w.put(stem, columns)
+    w.rejected = (f"again-{block}",)
+    return ["run", w.catalogue, w.fused]
 
 
 @case("camera that looks away from the ground")
@@ -738,6 +754,7 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("network", "fused"):
         create(str(folder / name), area_of(region), catalogue.metadata, 60.0, 20.0)
     run(catalogue, str(folder / "fused"), SerialExecutor())
+    compile_kernels()  # what is compiled is also written, and could not be on a full disk
     return folder
 
 
