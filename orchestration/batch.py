@@ -36,6 +36,8 @@ from submin.storage.network_store import Snapshot, commit, writable_session
 from submin.tiling.cover import Cover
 
 BLOCKS_A_TASK = 8
+LEAST_AGREEING = 0.5
+"""Part of a block's rays that its own adjustment must accept: fewer are no blunders in a good block."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +118,22 @@ def _stage_one(
     outcomes = {outcome.block_id: outcome for group in executor.results(handles) for outcome in group}
     good = []
     for block in blocks:
-        reason = outcomes[block.block_id].reason
+        reason = outcomes[block.block_id].reason or _disagreement(outcomes[block.block_id].accepted)
         if reason is None:
             good.append(block)
         else:
             refused.append(Rejected(block.block_id, reason))
     return good, {block.block_id: outcomes[block.block_id].accepted for block in good}
+
+
+def _disagreement(accepted: NDArray[np.bool_]) -> str | None:
+    """Why a block whose rays contradict each other stays out: its points would be registered where they are not, against good blocks."""
+    if accepted.sum() >= LEAST_AGREEING * len(accepted):
+        return None
+    return (
+        f"only {accepted.sum()} of the block's {len(accepted)} rays agree with each other; "
+        "check the order of sample and line, the point ids and the cameras"
+    )
 
 
 def _register(

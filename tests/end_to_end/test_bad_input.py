@@ -625,6 +625,17 @@ def _(w: World) -> list[Any]:
     return w.run(rejected=block)
 
 
+@case("sample and line exchanged in a block")
+def _(w: World) -> list[Any]:
+    block = w.block(0)
+    rays = w.columns("measurements")
+    pairs = list(zip(rays["sample"], rays["line"], rays["block_id"], strict=True))
+    rays["sample"] = [line if b == block else sample for sample, line, b in pairs]
+    rays["line"] = [sample if b == block else line for sample, line, b in pairs]
+    w.put("measurements", rays)
+    return w.run(rejected=block)
+
+
 @case("block known with other content")
 def _(w: World) -> list[Any]:
     w.set("measurements", "sample", w.columns("measurements")["sample"][0] + 1.0)
