@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from submin.errors import SubminError
+from submin.errors import InputError, SubminError
 
 if TYPE_CHECKING:
     from submin.storage.network_store import Version
@@ -33,12 +33,16 @@ app.add_typer(control_app, name="control")
 
 out = Console(highlight=False)
 
+MOST_WORKERS = 1024
+USAGE_ERROR: type[typer.BadParameter] = typer.BadParameter.__mro__[1]
+"""Base of all that the parser raises; newer releases of typer keep it in a private package."""
+
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 Box = Annotated[
     tuple[float, float, float, float] | None, typer.Option("--bbox", metavar="W S E N", help="West, south, east, north in degrees.")
 ]
 Aoi = Annotated[Path | None, typer.Option("--aoi", help="GeoJSON file with the area.")]
-Workers = Annotated[int, typer.Option("--workers", min=0, help="Processes of a local Dask cluster; 0 runs without one.")]
+Workers = Annotated[int, typer.Option("--workers", help="Processes of a local Dask cluster; 0 runs without one.")]
 Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")]
 
 
@@ -48,6 +52,12 @@ def show(values: dict[str, Any], as_json: bool, text: str) -> None:
         sys.stdout.write(json.dumps(values) + "\n")
     elif text:
         out.print(text, soft_wrap=True)
+
+
+def check_range(option: str, value: int, least: int, most: int | None = None) -> None:
+    """Refuse the value of an option that is out of its range."""
+    if value < least or (most is not None and value > most):
+        raise InputError(f"{option} is {value}; expected {least} {'or more' if most is None else f'to {most}'}")
 
 
 @import_app.command("rpc")
@@ -91,7 +101,6 @@ def simulate_region_command(
 
     Example: submin simulate region --out catalogue --scale 0.25
     """
-    from submin.errors import InputError
     from submin.simulation.region import RegionDesign, simulate_region
     from submin.storage.simulated import write_region
 
@@ -133,7 +142,6 @@ def create(
     """
     from orchestration.create import create as make
     from orchestration.create import fit_catalogue, read_area
-    from submin.errors import InputError
     from submin.storage.catalogue import Catalogue
     from submin.storage.catalogue_schema import CatalogueMetadata
     from submin.storage.network import box_area
@@ -160,7 +168,7 @@ def run(
     network: Annotated[str, typer.Argument(help="Network that takes them.")],
     workers: Workers = 0,
     scheduler: Scheduler = None,
-    batch_blocks: Annotated[int, typer.Option("--batch-blocks", min=1, help="Blocks that one commit holds.")] = 500,
+    batch_blocks: Annotated[int, typer.Option("--batch-blocks", help="Blocks that one commit holds.")] = 500,
     sequential: Annotated[bool, typer.Option("--sequential", help="Fuse block by block, in the order of the catalogue.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -173,6 +181,8 @@ def run(
     from orchestration.run import run as fuse
     from submin.storage.catalogue import Catalogue
 
+    check_range("--workers", workers, 0, MOST_WORKERS)
+    check_range("--batch-blocks", batch_blocks, 1)
     opened = Catalogue.open(catalogue)
     with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
@@ -256,7 +266,7 @@ def query(
     tile: Annotated[str | None, typer.Option("--tile", help="Name of a tile: its sub-MIN alone.")] = None,
     policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "auto",
     at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
-    max_points: Annotated[int | None, typer.Option("--max-points", min=1, help="At most so many points, well spread.")] = None,
+    max_points: Annotated[int | None, typer.Option("--max-points", help="At most so many points, well spread.")] = None,
     output: Annotated[
         Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")
     ] = None,
@@ -270,6 +280,8 @@ def query(
     from orchestration.create import read_area
     from orchestration.point_list import read_point_ids
 
+    if max_points is not None:
+        check_range("--max-points", max_points, 1)
     started = time.monotonic()
     control = submin.open(network, at).query(
         bbox=bbox, area=None if aoi is None else read_area(aoi), points=None if points is None else read_point_ids(points),
@@ -308,6 +320,7 @@ def check(
     """
     import submin
     from orchestration.check import check as compare
+    from submin.formats.replacing import replacing
     from submin.storage.point_table import read_point_table
 
     result = compare(submin.open(network), read_point_table(points), policy)
@@ -326,7 +339,7 @@ def check(
         f"when the stated covariance is exact); {result.missing} check points are not determined in the network"
     )
     if output is not None:
-        with output.open("w", encoding="utf-8") as stream:
+        with replacing(output) as temporary, temporary.open("w", encoding="utf-8") as stream:
             plain = Console(file=stream, width=160)
             plain.print(table)
             plain.print(closing, soft_wrap=True)
@@ -454,14 +467,26 @@ def _tags(version: Version) -> str:
 
 
 def main() -> None:
-    """Run the command line; an error of submin is one line on standard error and exit code 2."""
+    """Run the command line; an error is one line on standard error and exit code 2."""
     try:
-        app()
-    except SubminError as error:
-        Console(stderr=True, highlight=False, markup=False).print(f"submin: {error}", soft_wrap=True)
+        sys.exit(app(prog_name="submin", standalone_mode=False))
+    except (SubminError, OSError, USAGE_ERROR) as error:
+        message = " ".join(_message(error).split())
+        if message:  # a group of commands without one has printed its help
+            Console(stderr=True, highlight=False, markup=False).print(f"submin: {message}", soft_wrap=True)
         if "--json" in sys.argv:
-            sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
+            sys.stdout.write(json.dumps({"error": message}) + "\n")
         sys.exit(2)
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        return f"{name}cannot be read or written ({error.strerror or error}); check path, permissions and free space"
+    if isinstance(error, USAGE_ERROR):
+        context, said = getattr(error, "ctx", None), str(error.format_message()).rstrip(".")
+        return f"{said}; see '{context.command_path if context else 'submin'} --help'" if said else ""
+    return str(error)
 
 
 if __name__ == "__main__":

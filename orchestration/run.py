@@ -19,7 +19,7 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, control_point_of
 from submin.storage.ledger import Ledger
-from submin.storage.network_store import Snapshot
+from submin.storage.network_store import Snapshot, clear_write_errors
 
 DEFAULT_BATCH_BLOCKS = 500
 
@@ -118,7 +118,8 @@ def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_b
     while batch := list(islice(new, max(batch_blocks, 1))):
         good = [block for block, reason in batch if reason is None]
         refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-        tally.add(fuse_batch(place, good, refused, executor, reporter))
+        with clear_write_errors(place):
+            tally.add(fuse_batch(place, good, refused, executor, reporter))
         reporter.fused(len(batch))
     return tally
 

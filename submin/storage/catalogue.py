@@ -16,7 +16,9 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
@@ -90,6 +92,8 @@ class Catalogue:
             When metadata, images or priors cannot be used: file, row, value, what was expected.
         """
         folder = Path(path)
+        if folder.is_file():
+            raise CatalogueError(f"{folder}: is a file; expected a catalogue (a folder with catalogue.json)")
         if not folder.is_dir():
             raise CatalogueError(f"{folder}: no such folder; expected a catalogue (a folder with catalogue.json)")
         metadata = _from_json(folder / "catalogue.json", CatalogueMetadata.from_mapping)
@@ -175,8 +179,12 @@ class Catalogue:
                 image.pack()
             except InputError as error:
                 raise CatalogueError(f"{path}: row {row}: {error}") from None
+            if image.footprint:
+                read_footprint(image.footprint, f"{path}: row {row}: geometry of image {image.image_id}")
         path = required_path(self.path, "measurements")
         rays = sum(len(self._image_index(block_id, row, table, path)) for block_id, row, table in _runs(path))
+        if not rays:
+            raise CatalogueError(f"{path}: holds no measurements; expected at least one row")
         for kind in _COVARIANCE_OF:
             self.points(kind)
         return CatalogueSummary(self.block_count, len(self.images), rays)
@@ -208,6 +216,14 @@ class Catalogue:
             number_values(table, "sigma_sample", DEFAULT_SIGMA_PX),
             number_values(table, "sigma_line", DEFAULT_SIGMA_PX),
         )
+
+
+def read_footprint(footprint: bytes, name: str) -> BaseGeometry:
+    """The polygon of a footprint that ``name`` names in errors; raises `CatalogueError` when it is not WKB."""
+    try:
+        return shapely.from_wkb(footprint)
+    except shapely.GEOSException as error:
+        raise CatalogueError(f"{name} is not WKB ({error}); expected a polygon in longitude and latitude") from None
 
 
 def _runs(path: Path) -> Iterator[tuple[str, int, pa.Table]]:
@@ -242,7 +258,7 @@ def _from_json(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
     except FileNotFoundError:
         raise CatalogueError(f"{path}: no such file; expected the metadata of a catalogue") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CatalogueError(f"{path}: is not JSON ({error})") from None
+        raise CatalogueError(f"{path}: is not JSON ({error}); expected a JSON object in UTF-8") from None
     except InputError as error:
         raise CatalogueError(f"{path}: {error}") from None
 
@@ -287,5 +303,5 @@ def _read_images(path: Path) -> tuple[ImageRecord, ...]:
 
 __all__ = [
     "IMAGE_COLUMNS", "MEASUREMENT_COLUMNS",
-    "Block", "Catalogue", "CatalogueMetadata", "CatalogueSummary", "ImageRecord", "PointTable", "defects",
+    "Block", "Catalogue", "CatalogueMetadata", "CatalogueSummary", "ImageRecord", "PointTable", "defects", "read_footprint",
 ]  # fmt: skip

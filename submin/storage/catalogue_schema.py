@@ -27,6 +27,8 @@ Index = NDArray[np.int32]
 Ids = NDArray[np.str_]
 
 FORMAT_VERSION = 1
+LEAST_RAYS = 3
+"""A block with fewer rays ties nothing to anything: more likely a table cut short than a block."""
 DEFAULT_SIGMA_PX = 0.5
 """Standard deviation of a measured image coordinate for which a catalogue gives none, pixels."""
 
@@ -286,7 +288,7 @@ class Block:
 def defects(block: Block) -> str | None:
     """Why a block cannot be used as it is, in one line, or None: an error inside one block rejects that block and no other."""
     if not len(block):
-        return "the block has no measurements"
+        return "the block has no measurements; measure it, or remove its images"
 
     def ray(r: int) -> str:
         return f"point {block.point_ids[r]} in image {block.images[block.image[r]].image_id}"
@@ -310,6 +312,9 @@ def defects(block: Block) -> str | None:
     counts = np.bincount(block.image, minlength=len(block.images))
     if (counts == 0).any():
         return f"image {block.images[int(np.argmin(counts))].image_id} has no measurements; expected some in every image of the block"
+    if block.a_priori is not None and len(block) < LEAST_RAYS:
+        found = f"{len(block)} ray{'s' * (len(block) > 1)}"
+        return f"the block has {found}; expected at least {LEAST_RAYS}: measure more, or join it to another block"
     if block.a_priori is not None and block.a_priori.correlation in ("exponential", "gaussian"):
         for image in block.images:
             if not image.acquired:

@@ -143,11 +143,25 @@ def test_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         create_network(str(tmp_path / "file" / "network"), METADATA)
 
 
+def test_an_empty_folder_becomes_a_network_and_keeps_nothing_of_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "network").mkdir()
+
+    def full(*args: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    for place in ("network", "other"):
+        with monkeypatch.context() as patch, pytest.raises(StoreError, match=rf"{place}: cannot be written \(No space left on device\)"):
+            patch.setattr("submin.storage.network_store.create_table", full)
+            create_network(str(tmp_path / place), METADATA)
+    assert [path.name for path in tmp_path.rglob("*")] == ["network"]
+    assert Snapshot.open(new(tmp_path)).version == "v0"
+
+
 def test_what_is_not_a_network_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere: no such network; make one with 'submin create'"):
         Snapshot.open(str(tmp_path / "nowhere"))
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(StoreError, match="file: no such network"):
+    with pytest.raises(StoreError, match="file: is a file; expected the folder of a network"):
         Snapshot.open(str(tmp_path / "file"))
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "letter").write_text("mine")
