@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
+from inspect import signature
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -36,6 +37,8 @@ from submin.tiling.cover import Cover
 
 icechunk.set_logs_filter("icechunk=error")
 BRANCH = "main"
+_FIRST_FORMAT: dict[str, Any] = {"spec_version": 1} if "spec_version" in signature(icechunk.Repository.create).parameters else {}
+"""Icechunk 2 (which needs Python 3.12) reads and writes both formats, Icechunk 1 only the first: networks must travel."""
 _TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
 READ_OVER_ROWS = 256
 
@@ -99,7 +102,7 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
     try:
         if not remote:  # Icechunk panics where it cannot make the folder
             Path(making).mkdir(parents=True)
-        session = icechunk.Repository.create(_storage(making)).writable_session(BRANCH)
+        session = icechunk.Repository.create(_storage(making), **_FIRST_FORMAT).writable_session(BRANCH)
         root = zarr.create_group(session.store, attributes=metadata.to_attributes() | {"version": 0})
         root.create_group("cells")
         root.create_group("tiles")
