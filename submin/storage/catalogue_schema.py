@@ -240,6 +240,7 @@ class Block:
     image : (r,) index into ``images``
     sample, line : (r,) measured image coordinates, pixels
     sigma_sample, sigma_line : (r,) their standard deviations, pixels
+    source, first_row : file that holds the rays, and its row of the first one, for messages; empty when they come from no file
     """
 
     block_id: str
@@ -251,6 +252,8 @@ class Block:
     line: Array
     sigma_sample: Array
     sigma_line: Array
+    source: str = ""
+    first_row: int = 1
 
     def __post_init__(self) -> None:
         shapes = {name: np.shape(getattr(self, name)) for name in ("point_ids", "image", *_MEASURED)}
@@ -291,7 +294,8 @@ def defects(block: Block) -> str | None:
         return "the block has no measurements; measure it, or remove its images"
 
     def ray(r: int) -> str:
-        return f"point {block.point_ids[r]} in image {block.images[block.image[r]].image_id}"
+        place = f"{block.source}: row {block.first_row + r}: " if block.source else ""
+        return f"{place}point {block.point_ids[r]} in image {block.images[block.image[r]].image_id}"
 
     for name in _MEASURED:
         values = getattr(block, name)
