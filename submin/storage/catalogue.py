@@ -37,6 +37,7 @@ from submin.formats.columns import (
     text_values,
 )
 from submin.storage.catalogue_schema import (
+    CONTROL_PREFIX,
     DEFAULT_SIGMA_PX,
     POINT_KINDS,
     Block,
@@ -296,6 +297,11 @@ def _read_images(path: Path) -> tuple[ImageRecord, ...]:
             raise CatalogueError(
                 f"{path}: row {row}: image_id {image.image_id!r} is that of row {first_row[image.image_id]} too; expected it once"
             )
+        for name, value in (("image_id", image.image_id), ("block_id", image.block_id)):
+            if value.startswith(CONTROL_PREFIX):
+                raise CatalogueError(
+                    f"{path}: row {row}: {name} is {value!r}; expected another one: {CONTROL_PREFIX!r} begins those of control points"
+                )
         first_row[image.image_id] = row
         images.append(image)
     if not images:

@@ -34,6 +34,8 @@ DEFAULT_SIGMA_PX = 0.5
 
 COVARIANCE_COLUMNS = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 SIGMA_COLUMNS = ("sigma_e", "sigma_n", "sigma_u")
+CONTROL_PREFIX = "control:"
+"""Begins the block and image ids of control points; no catalogue may use it."""
 POINT_KINDS = ("control", "check", "truth")
 
 _COMPACT_UTC = re.compile(r"(\d{14})(\.\d+)?")

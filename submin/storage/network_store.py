@@ -165,11 +165,12 @@ def tag_version(place: str, tag: str, name: str | None = None) -> Version:
     """
     if not _TAG.fullmatch(tag) or _OWN_NAME.fullmatch(tag):
         raise StoreError(f"tag is {tag!r}; expected a word of letters, digits, '.', '_' and '-' that is no version's own name such as v12")
+    for known in versions(place):
+        if tag in known.tags:
+            raise StoreError(f"{place}: tag {tag!r} is that of {known.name}; expected a new one: a tag is given once")
     version = versions(place)[0] if name is None else find_version(place, name)
-    try:
+    with clear_write_errors(place):
         _open_repository(place).create_tag(tag, snapshot_id=version.snapshot)
-    except icechunk.IcechunkError as error:
-        raise StoreError(f"{place}: tag {tag!r} cannot be made ({str(error).strip().splitlines()[0]}); a tag is given once") from None
     return replace(version, tags=(*version.tags, tag))
 
 

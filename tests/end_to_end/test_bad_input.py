@@ -27,6 +27,7 @@ import shapely
 import zarr
 from networks import accepted_rays, area_of
 
+import submin
 from orchestration.cli import main
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
@@ -34,7 +35,7 @@ from orchestration.run import run
 from submin.adjustment.warm_up import compile_kernels
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.network_store import Snapshot, tag_version, versions
 from submin.storage.simulated import write_region
 
 ROOT = Path(__file__).parents[2]
@@ -102,6 +103,11 @@ class World:
     def fused(self) -> Path:
         """The catalogue is in."""
         return self._copy("fused")
+
+    def tagged(self) -> Path:
+        """The catalogue is in, and its version has the tag ``mine``."""
+        tag_version(str(self.fused), "mine")
+        return self.fused
 
     @property
     def new(self) -> Path:
@@ -700,6 +706,50 @@ def _(w: World) -> list[Any]:
     return ["map", w.fused, "--out", w.folder / "map.png"]
 
 
+# --- withdrawal, control and tags -------------------------------------------------------------------------------------------------------
+
+HEADER = "point_id,longitude,latitude,height"
+
+
+def surveyed(w: World, header: str, *rows: str) -> list[Any]:
+    """Control points in a file, and the command that adds them."""
+    return ["control", "add", w.fused, w.write("survey.csv", "\n".join([header, *rows]))]
+
+
+simply("nothing named to be withdrawn", lambda w: ["withdraw", w.fused])
+simply("two things named to be withdrawn", lambda w: ["withdraw", w.fused, "--block", w.block(), "--control", "P"])
+simply("withdrawal of a block that is not there", lambda w: ["withdraw", w.network, "--block", w.block()])
+simply("withdrawal of a control point that is not there", lambda w: ["withdraw", w.fused, "--control", "P"])
+simply("added control without covariance", lambda w: surveyed(w, HEADER, "P,100,35,0"))
+simply("added control with a sigma of zero", lambda w: surveyed(w, f"{HEADER},sigma_e,sigma_n,sigma_u", "P,100,35,0,1,0,1"))
+simply("tag that is taken", lambda w: ["tag", w.tagged(), "mine"])
+simply("tag like a version", lambda w: ["tag", w.fused, "v1"])
+simply("difference to an unknown version", lambda w: ["diff", w.fused, "v0", "v8"])
+
+
+@case("correlated control")
+def _(w: World) -> list[Any]:
+    network = w.fused
+    ids = Catalogue.open(w.catalogue).points("check").point_ids[:2]  # type: ignore[union-attr]
+    submin.open(network).query(points=ids).to_parquet(w.folder / "joint.parquet")
+    return ["control", "add", network, w.folder / "joint.parquet"]
+
+
+@case("image id of a control point")
+def _(w: World) -> list[Any]:
+    w.set("images", "image_id", "control:P:0")
+    return w.run()
+
+
+@case("tile that was split")
+def _(w: World) -> list[Any]:
+    catalogue = Catalogue.open(w.catalogue)
+    area = shapely.box(99.5, 34.5, 100.5, 35.5)
+    create(str(w.new), area, catalogue.metadata, 200.0, 20.0, max_parameters=60)
+    run(catalogue, str(w.new), SerialExecutor())
+    return ["query", w.new, "--tile", "r000c000"]
+
+
 # --- imports ----------------------------------------------------------------------------------------------------------------------------
 
 
@@ -817,7 +867,7 @@ def refused(world: World, words: list[Any], row: Row, call: Call) -> None:
     before, known = state(world.folder), len(versions(str(network))) if network.exists() else 0
     with world.around():
         code, out, err = call(*words)
-        at = 2 if words[0] in ("import", "simulate") else 1
+        at = 2 if words[0] in ("import", "simulate", "control") else 1
         as_json = call(*words[:at], "--json", *words[at:])
     assert (code, out) == (2, "")
     assert err.startswith("submin: ") and err.endswith("\n") and err.count("\n") == 1
