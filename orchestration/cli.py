@@ -1,6 +1,7 @@
 """The command line: ``submin COMMAND``.
 
-Exit codes: 0 done; 1 done in part (some blocks rejected; each is named with its reason); 2 wrong usage or bad input, nothing written.
+Exit codes: 0 done; 1 done in part (some blocks rejected; each is named with its reason); 2 wrong usage or bad input, nothing written,
+or the cluster was lost (what was committed stays); 130 and 143 stopped by Ctrl-C and by SIGTERM (what was committed stays).
 """
 
 from __future__ import annotations
@@ -9,13 +10,13 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from submin.errors import SubminError
+from orchestration.stopping import Stopped, signals_stop
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich",
@@ -163,10 +164,11 @@ def run(
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
     from orchestration.run import run as fuse
+    from orchestration.stopping import resumable
     from submin.storage.catalogue import Catalogue
 
     opened = Catalogue.open(catalogue)
-    with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
     lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
     if result.rays_used:
@@ -334,14 +336,24 @@ def history(network: Annotated[str, typer.Argument(help="Network.")], as_json: J
 
 
 def main() -> None:
-    """Run the command line; an error of submin is one line on standard error and exit code 2."""
+    """Run the command line; an error of submin, or a signal to stop, is one line on standard error."""
     try:
-        app()
-    except SubminError as error:
-        Console(stderr=True, highlight=False, markup=False).print(f"submin: {error}", soft_wrap=True)
-        if "--json" in sys.argv:
-            sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
-        sys.exit(2)
+        with signals_stop():
+            from submin.errors import SubminError  # the first import that takes time
+
+            try:
+                app()
+            except SubminError as error:
+                _fail(str(error), 2)
+    except Stopped as stopped:
+        _fail(str(stopped), stopped.exit_code)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    Console(stderr=True, highlight=False, markup=False).print(f"submin: {message}", soft_wrap=True)
+    if "--json" in sys.argv:
+        sys.stdout.write(json.dumps({"error": message}) + "\n")
+    sys.exit(code)
 
 
 if __name__ == "__main__":

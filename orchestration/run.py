@@ -18,6 +18,7 @@ from submin.errors import InputError
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, defects
 from submin.storage.network_store import Snapshot
+from submin.storage.writer_lock import writing
 
 DEFAULT_BATCH_BLOCKS = 500
 
@@ -117,9 +118,15 @@ def run(
     ------
     InputError
         When the catalogue breaks its contract, or its frame is not the network's: found before anything is written.
+    BusyError
+        When another process is writing to the network.
     """
+    with writing(place):
+        return _run(catalogue, place, executor, batch_blocks, reporter or Silent())
+
+
+def _run(catalogue: Catalogue, place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> RunResult:
     started = time.monotonic()
-    reporter = reporter or Silent()
     snapshot = Snapshot.open(place)
     check_frames(catalogue, snapshot)
     summary = catalogue.validate()
