@@ -10,7 +10,7 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -18,14 +18,19 @@ from rich.table import Table
 
 from orchestration.stopping import Stopped, signals_stop
 
+if TYPE_CHECKING:
+    from submin.storage.network_store import Version
+
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich",
     help="Ground-control networks for a continent: blocks of satellite images in, control points with joint covariance out.",
 )  # fmt: skip
+control_app = typer.Typer(no_args_is_help=True, help="Surveyed control points.")
 import_app = typer.Typer(no_args_is_help=True, help="Make a catalogue from other files.")
 simulate_app = typer.Typer(no_args_is_help=True, help="Make a catalogue of simulated images, with truth.")
 app.add_typer(import_app, name="import")
 app.add_typer(simulate_app, name="simulate")
+app.add_typer(control_app, name="control")
 
 out = Console(highlight=False)
 
@@ -118,6 +123,9 @@ def create(
     form: Annotated[str, typer.Option("--form", help="Form of the sub-MINs.")] = "factored",
     frame: Annotated[str, typer.Option("--frame", help="Frame of the coordinates; with --fit the catalogue's.")] = "WGS84",
     epoch: Annotated[str, typer.Option("--epoch", help="Epoch of the frame; with --fit the catalogue's.")] = "",
+    max_parameters: Annotated[
+        int, typer.Option("--max-parameters", min=60, help="A tile that sees more image parameters (6 an image) is split into four.")
+    ] = 2500,
     as_json: Json = False,
 ) -> None:
     """Make an empty network over an area.
@@ -141,7 +149,7 @@ def create(
         overlap_km = min(shared, 0.5 * tile_km) if overlap_km is None else overlap_km
     else:
         area = box_area(bbox) if bbox is not None else read_area(aoi)  # type: ignore[arg-type]
-    made = make(network, area, metadata, tile_km, overlap_km, form)
+    made = make(network, area, metadata, tile_km, overlap_km, form, max_parameters)
     cover = made.cover
     show(made.to_json(), as_json, f"{network}: {cover.rows} x {cover.columns} tiles, cores of {cover.core / 1000:g} km, "
          f"overlap {cover.overlap / 1000:g} km, frame {metadata.frame}")  # fmt: skip
@@ -184,6 +192,59 @@ def run(
     show(result.to_json(), as_json, "\n".join(lines))
     if result.rejected:
         raise typer.Exit(1)
+
+
+@control_app.command("add")
+def control_add(
+    network: Annotated[str, typer.Argument(help="Network that takes them.")],
+    points: Annotated[Path, typer.Argument(help="Table of surveyed points with their covariance or sigmas.")],
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Add surveyed control points, known by the ids of tie points or new ones. The same file again does nothing.
+
+    Example: submin control add network control.parquet
+    """
+    from orchestration.control import add_control
+    from orchestration.executors import executor_for
+    from orchestration.progress import progress_bars
+    from submin.storage.point_table import read_point_table
+
+    table = read_point_table(points, "definite")
+    with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+        added = add_control(table, str(points), network, executor, reporter)
+    lines = [
+        f"{network} {added.version}: {added.fused} control points added, {added.skipped} already there, {len(added.rejected)} rejected"
+    ]
+    lines += [f"rejected {r.point_id}: {r.reason}" for r in added.rejected]
+    show(added.to_json(), as_json, "\n".join(lines))
+    if added.rejected:
+        raise typer.Exit(1)
+
+
+@app.command()
+def withdraw(
+    network: Annotated[str, typer.Argument(help="Network to withdraw from.")],
+    block: Annotated[str | None, typer.Option("--block", help="Id of a block, with all its images.")] = None,
+    image: Annotated[str | None, typer.Option("--image", help="Id of one image; the rest of its block stays.")] = None,
+    control: Annotated[str | None, typer.Option("--control", help="Id of a control point.")] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Withdraw a block, an image or a control point, as if it had never been fused. It can come again.
+
+    Example: submin withdraw network --image IMAGE_17
+    """
+    from orchestration.executors import executor_for
+    from orchestration.progress import progress_bars
+    from orchestration.withdraw import withdraw as take
+
+    with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+        done = take(network, executor, block=block, image=image, control=control, reporter=reporter)
+    show(done.to_json(), as_json, f"{network} {done.version}: {done.what} withdrawn with {done.rays:,} rays; "
+         f"{len(done.tiles)} tiles judged again")  # fmt: skip
 
 
 @app.command()
@@ -321,6 +382,60 @@ def info(
 
 
 @app.command()
+def diff(
+    network: Annotated[str, typer.Argument(help="Network.")],
+    before: Annotated[str, typer.Argument(metavar="VERSION1", help="The one version, such as v11 or a tag.")],
+    after: Annotated[str, typer.Argument(metavar="VERSION2", help="The other.")],
+    as_json: Json = False,
+) -> None:
+    """Points that moved between two versions, by how much, against the CE90 and LE90 that the first one stated.
+
+    Example: submin diff network v11 v12
+    """
+    import submin
+    from orchestration.diff import difference
+
+    found = difference(submin.open(network, before), submin.open(network, after))
+    values = found.to_json()
+    if as_json or not len(found.ids):
+        show(values, as_json, f"{network}: {found.before} has {len(found.gone)} points, {found.after} has {len(found.new)}, none in common")
+        return
+    out.print(
+        f"{network} {found.before} to {found.after}: {len(found.ids):,} points in both, {len(found.new):,} new, {len(found.gone):,} gone; "
+        f"{values['beyond_stated']:,} moved by more than the CE90 or LE90 stated in {found.before}", soft_wrap=True,
+    )  # fmt: skip
+    table = Table(title_justify="left")
+    for heading in ("", "moved 50 %", "90 %", "most", f"median stated in {found.before}", f"in {found.after}"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for name, stated in (("horizontal", "ce90_median"), ("vertical", "le90_median")):
+        table.add_row(name, *(f"{values[name][q]:.3g} m" for q in ("p50", "p90", "max")), *(f"{v:.3g} m" for v in values[stated]))
+    out.print(table)
+    worst = Table(title="points that moved most, against what was stated", title_justify="left")
+    for heading in ("point", "horizontal", "CE90", "up", "LE90"):
+        worst.add_column(heading, justify="left" if heading == "point" else "right")
+    for row in values["worst"]:
+        worst.add_row(row["point_id"], *(f"{row[name]:.3g} m" for name in ("horizontal", "ce90", "vertical", "le90")))
+    out.print(worst)
+
+
+@app.command()
+def tag(
+    network: Annotated[str, typer.Argument(help="Network.")],
+    name: Annotated[str, typer.Argument(help="Name to give, a word such as delivered-2026.")],
+    at: Annotated[str | None, typer.Option("--at", help="Version; default: the newest.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Give a version a name that stays; --at takes it wherever it takes a version.
+
+    Example: submin tag network delivered-2026 --at v12
+    """
+    from submin.storage.network_store import tag_version
+
+    version = tag_version(network, name, at)
+    show({"version": version.name, "tags": list(version.tags)}, as_json, f"{network} {version.name} is tagged {name}")
+
+
+@app.command()
 def history(network: Annotated[str, typer.Argument(help="Network.")], as_json: Json = False) -> None:
     """Versions of a network, the newest first.
 
@@ -330,9 +445,14 @@ def history(network: Annotated[str, typer.Argument(help="Network.")], as_json: J
 
     found = versions(network)
     values = {
-        "versions": [{"version": v.name, "written": v.written.isoformat(), "message": v.message, "snapshot": v.snapshot} for v in found]
-    }
-    show(values, as_json, "\n".join(f"{v.name:>6}  {v.written:%Y-%m-%d %H:%M:%S}  {v.message}" for v in found))
+        "versions": [{"version": v.name, "written": v.written.isoformat(), "message": v.message, "snapshot": v.snapshot,
+                      "tags": list(v.tags)} for v in found]
+    }  # fmt: skip
+    show(values, as_json, "\n".join(f"{v.name:>6}  {v.written:%Y-%m-%d %H:%M:%S}  {v.message}{_tags(v)}" for v in found))
+
+
+def _tags(version: Version) -> str:
+    return f"  ({', '.join(version.tags)})" if version.tags else ""
 
 
 def main() -> None:

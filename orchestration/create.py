@@ -35,13 +35,19 @@ class Created:
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "network": self.place, "tiles": self.cover.rows * self.cover.columns, "rows": self.cover.rows, "columns": self.cover.columns,
+            "network": self.place, "tiles": self.cover.tile_count, "rows": self.cover.rows, "columns": self.cover.columns,
             "tile_km": self.cover.core / 1000.0, "overlap_km": self.cover.overlap / 1000.0, "frame": self.metadata.frame, "version": "v0",
         }  # fmt: skip
 
 
 def create(
-    place: str, area: BaseGeometry, metadata: CatalogueMetadata, tile_km: float | None, overlap_km: float | None, form: str = "factored"
+    place: str,
+    area: BaseGeometry,
+    metadata: CatalogueMetadata,
+    tile_km: float | None,
+    overlap_km: float | None,
+    form: str = "factored",
+    max_parameters: int = 2500,
 ) -> Created:
     """Create an empty network over an area (longitude and latitude, degrees).
 
@@ -60,7 +66,7 @@ def create(
     network = NetworkMetadata(
         name=Path(place).name, body=metadata.body, frame=metadata.frame, epoch=metadata.epoch,
         semimajor_axis=metadata.semimajor_axis, flattening=metadata.flattening, cover=cover.to_mapping(), form=form,
-        parameters=WIDEST,
+        parameters=WIDEST, max_parameters=max_parameters,
     )  # fmt: skip
     create_network(place, network)
     return Created(place, cover, network)

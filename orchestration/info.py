@@ -9,14 +9,16 @@ import numpy as np
 
 from submin import Network
 from submin.storage.accuracy_map import accuracy_map
+from submin.storage.ledger import Ledger
 
 
 def describe(network: Network) -> dict[str, Any]:
     """Numbers of ``submin info``: counts, median accuracy, size."""
     snapshot = network.snapshot
     cells = [snapshot.cell_attributes(number) for number in network.cell_numbers()]
-    released = snapshot.image_columns(["image_id", "released"])
-    status = snapshot.ledger(["block_id", "status"])
+    images = snapshot.image_columns(["image_id", "sensor", "released", "withdrawn"])
+    here = (images["withdrawn"] == 0) & (images["sensor"] != "survey")
+    ledger = Ledger.of(snapshot)
     accuracy = accuracy_map(network)
     place = snapshot.place
     size = sum(f.stat().st_size for f in Path(place).rglob("*") if f.is_file()) if "://" not in place else -1
@@ -26,9 +28,10 @@ def describe(network: Network) -> dict[str, Any]:
         "points_pending": int(sum(c["points"] for c in cells)) - len(accuracy.ids),
         "rays": int(sum(c["rays"] for c in cells)),
         "rays_rejected": int(sum(c["rays"] - c["accepted"] for c in cells)),
-        "images": snapshot.image_count(),
-        "images_flagged": ", ".join(released["image_id"][released["released"] == 1].tolist()),
-        "blocks": int((status["status"] == "fused").sum()),
+        "images": int(here.sum()),
+        "images_flagged": ", ".join(images["image_id"][here & (images["released"] == 1)].tolist()),
+        "blocks": len(ledger.fused()),
+        "control_points": len(ledger.control_points()),
         "tiles": len(snapshot.tile_numbers()),
         "cells": len(cells),
         "ce90_median": float(np.median(accuracy.ce90)) if len(accuracy.ids) else float("nan"),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,9 @@ from orchestration.progress import Reporter, Silent
 from orchestration.tasks import FlaggedImage
 from submin.errors import InputError
 from submin.storage.catalogue import Catalogue
-from submin.storage.catalogue_schema import Block, defects
+from submin.storage.catalogue_schema import Block
+from submin.storage.control_blocks import control_blocks, control_point_of
+from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import writing
 
@@ -30,12 +32,14 @@ class RunResult:
     Attributes
     ----------
     version : of the network afterwards; fused, skipped : numbers of blocks; rejected, flagged : with reasons
+    control_fused : number of control points
     rays_used, rays_rejected : rays in the network afterwards; ray_rms_px : residual of the used ones, per coordinate
     """
 
     version: str
     fused: int
     skipped: int
+    control_fused: int
     rejected: tuple[Rejected, ...]
     flagged: tuple[FlaggedImage, ...]
     ray_rms_px: float
@@ -51,6 +55,7 @@ class RunResult:
             "version": self.version,
             "blocks_fused": self.fused,
             "blocks_skipped": self.skipped,
+            "control_fused": self.control_fused,
             "blocks_rejected": [{"block_id": r.block_id, "reason": r.reason} for r in self.rejected],
             "images_flagged": [{"image_id": f.image_id, "reason": f.reason} for f in self.flagged],
             "ray_rms_px": self.ray_rms_px,
@@ -63,50 +68,24 @@ class RunResult:
 
 
 @dataclass
-class Ledger:
-    """What is already in the network, as the run needs it: content of fused blocks, block of each image."""
+class Tally:
+    """What has become of the blocks so far."""
 
-    content: dict[str, str]
-    block_of_image: dict[str, str]
-
-    @classmethod
-    def of(cls, snapshot: Snapshot) -> Ledger:
-        """The ledger of a version."""
-        table = snapshot.ledger(["block_id", "content", "status"])
-        content = {
-            str(b): str(c) for b, c, s in zip(table["block_id"], table["content"], table["status"], strict=True) if s == "fused"
-        }  # fmt: skip
-        images = snapshot.image_columns(["image_id", "block_id"])
-        return cls(content, dict(zip(images["image_id"].tolist(), images["block_id"].tolist(), strict=True)))
-
-    def refusal(self, block: Block) -> str | None:
-        """Why a block that is not the same as before cannot come in, or None."""
-        if block.block_id in self.content:
-            return f"block {block.block_id} is already in the network with other content; withdraw it first, or give the new one another id"
-        for image in block.images:
-            if image.image_id in self.block_of_image:
-                return f"image {image.image_id} already came in block {self.block_of_image[image.image_id]}; an image counts once"
-        return defects(block)
-
-    def enter(self, block: Block) -> None:
-        """A block is on its way in: nothing later in the run may bring it or its images again."""
-        self.content[block.block_id] = block.content_hash()
-        self.block_of_image.update((image.image_id, block.block_id) for image in block.images)
-
-
-@dataclass
-class _Tally:
     rejected: list[Rejected] = field(default_factory=list)
     flagged: dict[int, FlaggedImage] = field(default_factory=dict)
     unsettled: set[int] = field(default_factory=set)
     fused: int = 0
+    control: int = 0
     skipped: int = 0
 
     def add(self, batch: BatchResult) -> None:
+        """Count a batch."""
         self.rejected.extend(batch.rejected)
         self.flagged.update({f.row: f for f in batch.flagged})
         self.unsettled = (self.unsettled - set(batch.tiles)) | set(batch.unsettled)
-        self.fused += len(batch.fused)
+        control = sum(control_point_of(block_id) is not None for block_id in batch.fused)
+        self.control += control
+        self.fused += len(batch.fused) - control
 
 
 def run(
@@ -130,32 +109,45 @@ def _run(catalogue: Catalogue, place: str, executor: Executor, batch_blocks: int
     snapshot = Snapshot.open(place)
     check_frames(catalogue, snapshot)
     summary = catalogue.validate()
-    ledger, tally = Ledger.of(snapshot), _Tally()
-    reporter.begin(summary.blocks)
-    blocks = _new_blocks(catalogue, ledger, tally, reporter)
-    while batch := list(islice(blocks, max(batch_blocks, 1))):
+    control = catalogue.points("control")
+    reporter.begin(summary.blocks + (0 if control is None else len(control)))
+    every = chain(
+        catalogue.blocks(), () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
+    )
+    tally = fuse_blocks(every, place, executor, batch_blocks, reporter)
+    return _result(Snapshot.open(place), snapshot, tally, started, executor)
+
+
+def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> Tally:
+    """Fuse those of some blocks that the network does not have yet, so many to a commit."""
+    tally = Tally()
+    new = _new_blocks(blocks, Ledger.of(Snapshot.open(place)), tally, reporter)
+    while batch := list(islice(new, max(batch_blocks, 1))):
         good = [block for block, reason in batch if reason is None]
         refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
         tally.add(fuse_batch(place, good, refused, executor, reporter))
         reporter.fused(len(batch))
+    return tally
 
-    after = Snapshot.open(place)
-    released = {row for _, row in after.flags()} - {row for _, row in snapshot.flags()}
+
+def _result(after: Snapshot, before: Snapshot, tally: Tally, started: float, executor: Executor) -> RunResult:
+    released = {row for _, row in after.flags()} - {row for _, row in before.flags()}
     cells = [after.cell_attributes(number) for number in after.cell_numbers()]
-    used = sum(cell["accepted"] for cell in cells)
+    used, in_pixels = (sum(cell[name] for cell in cells) for name in ("accepted", "pixel_rays"))
     square = sum(cell["square_px"] for cell in cells)
     return RunResult(
-        after.version, tally.fused, tally.skipped, tuple(tally.rejected), tuple(tally.flagged[row] for row in sorted(released)),
-        float(np.sqrt(square / (2.0 * used))) if used else 0.0, used, sum(cell["rays"] for cell in cells) - used,
+        after.version, tally.fused, tally.skipped, tally.control,
+        tuple(tally.rejected), tuple(tally.flagged[row] for row in sorted(released)),
+        float(np.sqrt(square / (2.0 * in_pixels))) if in_pixels else 0.0, used, sum(cell["rays"] for cell in cells) - used,
         tuple(after.cover.tile_name(t) for t in sorted(tally.unsettled)), time.monotonic() - started, executor.peak_memory_mb(),
     )  # fmt: skip
 
 
-def _new_blocks(catalogue: Catalogue, ledger: Ledger, tally: _Tally, reporter: Reporter) -> Iterator[tuple[Block, str | None]]:
+def _new_blocks(blocks: Iterable[Block], ledger: Ledger, tally: Tally, reporter: Reporter) -> Iterator[tuple[Block, str | None]]:
     """Blocks that the network does not have, each with the reason for which it cannot come in, if any."""
-    for block in catalogue.blocks():
-        if ledger.content.get(block.block_id) == block.content_hash():
-            tally.skipped += 1
+    for block in blocks:
+        if ledger.holds(block):
+            tally.skipped += control_point_of(block.block_id) is None
             reporter.fused(1)
             continue
         reason = ledger.refusal(block)

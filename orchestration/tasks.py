@@ -20,11 +20,13 @@ from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
 from submin.errors import SubminError
 from submin.geodesy import Ellipsoid
-from submin.network.cell import SECOND_ORDER_PIXELS, Cell, NewRays, bundle, second_order, summed, union_of_images, with_rays, without_points
+from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import add_sums, factor
+from submin.sensors import sensor_named
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import write_cell, write_sub_min
+from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -68,6 +70,12 @@ class CellReport:
     used: NDArray[np.int64]
     rejected: NDArray[np.int64]
 
+    @classmethod
+    def empty(cls) -> CellReport:
+        """Of a cell without rays."""
+        none = np.empty(0, dtype=np.int64)
+        return cls(none.astype(np.int32), none, none)
+
 
 @dataclass(frozen=True)
 class TileUpdate:
@@ -92,7 +100,7 @@ class TileReport:
 
 @dataclass(frozen=True)
 class TileFactored:
-    """A tile's sub-MIN has been written."""
+    """A tile's sub-MIN has been written; without images there is none any more."""
 
     tile: int
     images: int
@@ -137,56 +145,77 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
 def update_tile(
     writes: icechunk.ForkSession,
     tile: int,
-    arrivals: Mapping[int, NewRays],
+    cover: Cover,
+    arrivals: Mapping[int, RegisteredPoints],
     departures: Mapping[int, NDArray[np.str_]],
     new_images: Sequence[NetworkImage],
 ) -> TileUpdate:
     """Judge the rays that a tile holds, and sum its own cells.
 
     All rays that the tile holds are adjusted together (they include the neighbours' rays in shared cells); the tile decides only for the
-    points of its own core. An own cell is summed again when its rays, decisions or linearisation changed.
+    points of its own core. What comes out depends on the rays alone: every ray and image is judged afresh, also one rejected or released
+    on less evidence, from the registered positions, images in the order of their ids (decision 006).
     """
     root = zarr.open_group(writes.store, mode="r+")
-    snapshot = Snapshot(root, "network")
-    cells = {}
-    for number in snapshot.cover.cells_held(tile):
+    snapshot = Snapshot(root, "network", cover)
+    held = []
+    for number in cover.cells_held(tile):
         cell = snapshot.cell(number)
         if number in departures:
             cell = without_points(cell, departures[number])
         if number in arrivals:
-            cell = with_rays(cell, arrivals[number])
-        cells[number] = cell
-    # a cell that has lost its last point is kept here, so that its empty state is written
-    held = [cell for cell in cells.values() if len(cell) or cell.number in departures]
-    rows = union_of_images(held)
-    # every ray and image is judged afresh, also one rejected or released on less evidence: decisions follow from the rays, not from their
-    # order
-    judged_images = [replace(image, released=False) for image in _images(snapshot, rows, new_images)]
-    images = image_set(judged_images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters)
-    rays, registered = bundle(held, rows)
-    rays = rays.with_accepted(np.ones(len(rays), dtype=np.bool_))
-    result = adjust(images, rays, np.concatenate([cell.linearised_at for cell in held]), registered)
+            cell = with_points(cell, arrivals[number])
+        if len(cell) or number in departures:
+            held.append(cell)
+    seen = union_of_images(held)
+    if not len(seen):  # the last ray has gone
+        emptied = {cell.number: CellReport.empty() for cell in held if Cover.owner(cell.number) == tile}
+        nothing = {number: (seen, empty_sums(0, snapshot.metadata.parameters)) for number in emptied}
+        return TileUpdate(tile, nothing, TileReport(tile, tuple(emptied), emptied, (), True, writes))
+    members = sorted(zip(_images(snapshot, seen, new_images), seen.tolist(), strict=True), key=lambda member: member[0].image_id)
+    rows = np.array([row for _, row in members], dtype=np.int32)
+    images = image_set(
+        [replace(image, released=False) for image, _ in members], snapshot.metadata.ellipsoid, snapshot.metadata.parameters
+    )  # fmt: skip
+    together = bundle(held, rows)
+    result = adjust(images, together.rays, together.origin)
+    accepted = np.empty(len(together.row), dtype=np.bool_)
+    accepted[together.row] = result.accepted
+    squares = np.zeros(len(together.row))
+    squares[together.row] = np.nansum((result.residuals * together.rays.sigma) ** 2, axis=1) * images.in_pixels[together.rays.image]
+    in_pixels = np.zeros(len(together.row), dtype=np.bool_)
+    in_pixels[together.row] = images.in_pixels[together.rays.image]
 
     sums: dict[int, tuple[NDArray[np.int32], Sums]] = {}
     reports: dict[int, CellReport] = {}
     ray_at = np.cumsum([0, *(len(cell.rays) for cell in held)])
     point_at = np.cumsum([0, *(len(cell) for cell in held)])
-    squares = np.nansum((result.residuals * rays.sigma) ** 2, axis=1)
+    place = np.argsort(rows)
     for k, cell in enumerate(held):
-        if snapshot.cover.owner(cell.number) != tile:
+        if Cover.owner(cell.number) != tile:
             continue
         own_rays, own_points = slice(ray_at[k], ray_at[k + 1]), slice(point_at[k], point_at[k + 1])
-        own_images = np.searchsorted(rows, cell.images)
-        accepted, theta, ground = result.accepted[own_rays], result.theta[own_images], result.ground[own_points]
-        changed = cell.number in arrivals or cell.number in departures or not np.array_equal(accepted, cell.rays.accepted)
-        judged = replace(cell, rays=cell.rays.with_accepted(accepted))
-        if changed or second_order(judged, images.take(own_images), theta, ground) > SECOND_ORDER_PIXELS:
-            new = summed(replace(judged, theta=theta, linearised_at=ground), images.take(own_images))
-            write_cell(root, snapshot.cover.cell_name(cell.number), new, float(squares[own_rays].sum()))
+        own_images = place[np.searchsorted(rows, cell.images, sorter=place)]
+        judged = replace(
+            cell, rays=cell.rays.with_accepted(accepted[own_rays]), theta=result.theta[own_images], linearised_at=result.ground[own_points]
+        )  # fmt: skip
+        if cell.number in arrivals or cell.number in departures or not _same_state(judged, cell):
+            new = summed(judged, images.take(own_images))
+            if len(new):
+                counted = int((in_pixels[own_rays] & accepted[own_rays]).sum())
+                write_cell(root, cover.cell_name(cell.number), new, float(squares[own_rays].sum()), counted)
             sums[cell.number] = (new.images, new.sums)
         reports[cell.number] = _report(judged)
-    flagged = _flagged(result, images, rows)
-    return TileUpdate(tile, sums, TileReport(tile, tuple(sums), reports, flagged, result.converged, writes))
+    return TileUpdate(tile, sums, TileReport(tile, tuple(sums), reports, _flagged(result, images, rows), result.converged, writes))
+
+
+def _same_state(one: Cell, other: Cell) -> bool:
+    """True when two states of a cell's rays are decided and linearised alike."""
+    return (
+        np.array_equal(one.rays.accepted, other.rays.accepted)
+        and np.array_equal(one.theta, other.theta)
+        and np.array_equal(one.linearised_at, other.linearised_at)
+    )
 
 
 def report_of(update: TileUpdate) -> TileReport:
@@ -195,18 +224,23 @@ def report_of(update: TileUpdate) -> TileReport:
 
 
 def factor_tile(
-    writes: icechunk.ForkSession, tile: int, updates: Sequence[TileUpdate], new_images: Sequence[NetworkImage], released: Sequence[int]
+    writes: icechunk.ForkSession,
+    tile: int,
+    cover: Cover,
+    updates: Sequence[TileUpdate],
+    new_images: Sequence[NetworkImage],
+    released: Sequence[int],
 ) -> TileFactored:
     """One factorisation: the tile's sub-MIN from the sums of all cells that it holds, new ones from the updates, the others from the store.
 
     ``released`` are the rows of all images in the network whose prior is released.
     """
     root = zarr.open_group(writes.store, mode="r+")
-    snapshot = Snapshot(root, "network")
+    snapshot = Snapshot(root, "network", cover)
     fresh = {number: sums for update in updates for number, sums in update.sums.items()}
     parts = []
     cells = []
-    for number in snapshot.cover.cells_held(tile):
+    for number in cover.cells_held(tile):
         if number in fresh:
             part = fresh[number]
         else:
@@ -215,6 +249,8 @@ def factor_tile(
         if len(part[0]):
             parts.append(part)
             cells.append(number)
+    if not parts:
+        return TileFactored(tile, 0, writes)
     rows = np.unique(np.concatenate([part[0] for part in parts])).astype(np.int32)
     gone = set(released)
     images = [replace(image, released=int(row) in gone) for row, image in zip(rows, _images(snapshot, rows, new_images), strict=True)]
@@ -223,7 +259,7 @@ def factor_tile(
         rows,
         image_set(images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters),
     )
-    write_sub_min(root, snapshot.cover.tile_name(tile), sub_min, cells)
+    write_sub_min(root, cover.tile_name(tile), sub_min, cells)
     return TileFactored(tile, len(rows), writes)
 
 
@@ -241,18 +277,10 @@ def _report(cell: Cell) -> CellReport:
 
 
 def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> tuple[FlaggedImage, ...]:
-    names = (
-        "sample bias",
-        "sample drift along samples",
-        "sample drift along lines",
-        "line bias",
-        "line drift along samples",
-        "line drift along lines",
-    )
     flagged = []
-    # a judgement that has not come to rest names nobody
-    for k in np.flatnonzero(result.released & result.converged):
-        model = images.priors[k].a_priori
+    for k in np.flatnonzero(result.released):
+        model, names = images.priors[k].a_priori, sensor_named(images.sensors[k]).parameters
+        assert model is not None
         sigma = np.where(np.isin(np.arange(images.parameters), images.priors[k].bias), model.bias_px, model.drift_px)
         worst = int(np.argmax(np.abs(result.theta[k]) / sigma))
         flagged.append(FlaggedImage(

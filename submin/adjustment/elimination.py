@@ -124,6 +124,9 @@ def _eliminate(
         if 2 * n <= rank:
             continue
         redundancy += 2 * n - rank
+        for i in range(2 * n):  # a view along one axis only leaves the other row empty
+            if b[i, 0] == 0.0 and b[i, 1] == 0.0 and b[i, 2] == 0.0:
+                redundancy -= 1
         remove_ground(q, rank, 2 * n, t)
         for i in range(2 * n):
             misclosure += t[i] * t[i]

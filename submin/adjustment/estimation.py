@@ -42,6 +42,8 @@ class ImageEstimate:
         NumericalError
             When the factor is not that of a regular matrix.
         """
+        if not len(self.factor):
+            return np.zeros((self.prior.shape[0], self.prior.shape[0]))
         inverse, info = la.lapack.dpotri(self.factor, lower=1)
         if info != 0:
             raise NumericalError(f"the information matrix ({len(self.factor)} parameters) cannot be inverted")
@@ -95,6 +97,8 @@ def estimate_images(sums: Sums, prior: sp.csr_array, parameters: int) -> ImageEs
     """
     if not np.isfinite(sums.vector).all():
         raise NumericalError(f"the right-hand side of {len(sums.vector)} image parameters is not finite; a camera or a position is not")
+    if not prior.shape[1]:  # only images that have nothing to adjust
+        return ImageEstimate(np.zeros((len(sums.vector) // parameters, parameters)), sums.misclosure, np.empty((0, 0)), prior)
     factor = cholesky(reduced_information(sums.information, prior))
     right = prior.T @ sums.vector
     u, _ = la.lapack.dpotrs(factor, right, lower=1)

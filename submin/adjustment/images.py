@@ -47,6 +47,11 @@ class ImageSet:
         """A priori factor K (m p, q), see `prior_factor`."""
         return prior_factor(self.priors, self.parameters)
 
+    @cached_property
+    def in_pixels(self) -> NDArray[np.bool_]:
+        """True (m,) for images whose coordinates are pixels; a survey's are metres."""
+        return np.array([sensor_named(name).unit == "pixel" for name in self.sensors], dtype=np.bool_)
+
     def take(self, rows: Sequence[int] | NDArray[np.integer]) -> ImageSet:
         """The images of these rows, in this order."""
         return ImageSet(
@@ -69,7 +74,7 @@ class ImageSet:
     def project(self, parameters: Array, ground: Ground, image: Index, point: Index, at: Array | None = None) -> Projection:
         """Image coordinates of rays and their partials; see `submin.sensors.Sensor.project`."""
         names = set(self.sensors)
-        if len(names) == 1 and sensor_named(self.sensors[0]).parameters == self.parameters:
+        if len(names) == 1 and len(sensor_named(self.sensors[0]).parameters) == self.parameters:
             return sensor_named(self.sensors[0]).project(self.cameras, parameters, ground, image, point, at)
         rays = len(image)
         whole = Projection(np.empty((rays, 2)), np.empty((rays, 2, 3)), np.zeros((rays, 2, self.parameters)))
@@ -79,7 +84,7 @@ class ImageSet:
             where = None if at is None else at[chosen]
             part = sensor.project(self.cameras, parameters, ground, image[chosen], point[chosen], where)
             whole.image[chosen], whole.by_ground[chosen] = part.image, part.by_ground
-            whole.by_parameters[chosen, :, : sensor.parameters] = part.by_parameters
+            whole.by_parameters[chosen, :, : len(sensor.parameters)] = part.by_parameters
         return whole
 
     def localise(self, image: Index, observed: Array) -> Array:

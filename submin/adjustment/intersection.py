@@ -48,6 +48,7 @@ def intersect(images: ImageSet, rays: Rays, points: int) -> Intersection:
     hold = np.einsum("ni,nj->nij", up, up) / HEIGHT_SIGMA**2
     theta = np.zeros((len(images), images.parameters))
     misfit = np.zeros(len(rays))
+    moving = reached.copy()
     for _ in range(ITERATIONS):
         projection = images.project(theta, images.ground(ground), rays.image, rays.point)
         b = projection.by_ground / rays.sigma[:, :, None]
@@ -59,11 +60,12 @@ def intersect(images: ImageSet, rays: Rays, points: int) -> Intersection:
         normal[~reached] = np.eye(3)
         right[~reached] = 0.0
         step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-        step[~np.isfinite(step).all(axis=1)] = 0.0
+        step[~(np.isfinite(step).all(axis=1) & moving)] = 0.0  # each point stops by itself: its company must not matter
         ground = ground + step
         pixel = np.linalg.norm(projection.by_ground, axis=(1, 2)) / np.sqrt(2.0)
         misfit = np.linalg.norm(rays.observed - projection.image, axis=1) / pixel
-        if np.abs(step).max(initial=0.0) < 1e-3:
+        moving &= np.abs(step).max(axis=1) >= 1e-3
+        if not moving.any():
             break
     ground[~reached] = np.nan
     return Intersection(ground, misfit)

@@ -105,13 +105,13 @@ class APriori:
 
 @dataclass(frozen=True)
 class ImagePrior:
-    """What the a priori factor needs to know of one image."""
+    """What the a priori factor needs to know of one image; ``a_priori`` is None when it has nothing to adjust."""
 
     block_id: str
     pass_id: str
     seconds: float
-    a_priori: APriori
-    bias: tuple[int, int]
+    a_priori: APriori | None
+    bias: tuple[int, ...]
     released: bool = False
 
 
@@ -124,8 +124,9 @@ def correlation_factor(correlation: Array) -> Array:
 def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     """Factor ``K`` (m p, q) of the a priori covariance of m images with p parameters each, image-major.
 
-    Columns are whitened vectors: one for every image and parameter (its block's own parts), and two for every pass.
-    Images may be any subset of a network: ``K K'`` is then the marginal of the whole prior.
+    Columns are whitened vectors: one for every image and parameter (its block's own parts), and two for every pass. An image without
+    a priori model has none: its parameters are zero. Images may be any subset of a network: ``K K'`` is then the marginal of the whole
+    prior.
     """
     m, p = len(images), parameters
     rows: list[NDArray[np.int64]] = []
@@ -134,11 +135,14 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     blocks: dict[str, list[int]] = {}
     passes: dict[str, list[int]] = {}
     for i, image in enumerate(images):
-        blocks.setdefault(image.block_id, []).append(i)
-        passes.setdefault(image.pass_id, []).append(i)
+        if image.a_priori is not None:
+            blocks.setdefault(image.block_id, []).append(i)
+            passes.setdefault(image.pass_id, []).append(i)
 
+    column_of = np.cumsum([0, *(image.a_priori is not None for image in images)]) * p
     for members in blocks.values():
         model = images[members[0]].a_priori
+        assert model is not None
         own = np.full((len(members), p), model.drift_px)
         released = np.array([images[i].released for i in members])
         for k, i in enumerate(members):
@@ -151,20 +155,22 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
         factor = correlation_factor(np.where(alone, 0.0, correlation))
         at = np.array(members)
         for c in range(p):
-            row, column = np.meshgrid(at * p + c, at * p + c, indexing="ij")
+            row, column = np.meshgrid(at * p + c, column_of[at] + c, indexing="ij")
             rows.append(row.ravel())
             columns.append(column.ravel())
             values.append((factor * own[:, c : c + 1]).ravel())
 
     for k, members in enumerate(passes.values()):
         for i in members:
-            shared = images[i].a_priori.bias_px * np.sqrt(images[i].a_priori.common_to_pass)
+            model = images[i].a_priori
+            assert model is not None
+            shared = model.bias_px * np.sqrt(model.common_to_pass)
             rows.append(i * p + np.array(images[i].bias))
-            columns.append(m * p + 2 * k + np.arange(2))
+            columns.append(column_of[-1] + 2 * k + np.arange(2))
             values.append(np.full(2, shared))
 
-    shape = (m * p, m * p + 2 * len(passes))
-    if not m:
+    shape = (m * p, int(column_of[-1]) + 2 * len(passes))
+    if not blocks:
         return sp.csr_array(shape)
     factor_k = sp.coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsr()
     factor_k.eliminate_zeros()

@@ -12,16 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.elimination import LinearRays, PointFactors, Sums, eliminate, linearise, point_factors, residuals_of
+from submin.adjustment.elimination import LinearRays, PointFactors, Sums, eliminate, linearise, point_factors
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays, sorted_rays
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 Ids = NDArray[np.str_]
-
-SECOND_ORDER_PIXELS = 1e-4
-"""A cell is linearised anew when linear and exact predictions of one of its rays differ by more (0.03 mm on the ground at 0.3 m pixels)."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +29,8 @@ class Cell:
     ----------
     number : code of the cell in the cover
     point_ids : (n,) ids of its points, ascending
-    origin : (n, 3) registered position, geocentric metres: the fixed origin of each point's coordinates
+    origin : (n, 3) registered position, geocentric metres: the origin of each point's coordinates
     linearised_at : (n, 3) position at which the point's rays are linearised
-    final : (n,) True once the registration is final (the point has had rays to determine it)
     images : (m,) rows of the network's images that see any of its points, ascending
     theta : (m, p) corrections at which these images are linearised
     rays : all rays of its points, rejected ones too; ``rays.point`` and ``rays.image`` are rows of this cell
@@ -45,7 +41,6 @@ class Cell:
     point_ids: Ids
     origin: Array
     linearised_at: Array
-    final: NDArray[np.bool_]
     images: Index
     theta: Array
     rays: Rays
@@ -56,26 +51,23 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class NewRays:
-    """Rays that join a cell, with the registration of their points.
+class RegisteredPoints:
+    """Points that join a cell, with all of their rays.
 
     Attributes
     ----------
     point_ids : (n,) ids of the points, unique
-    origin : (n, 3) registered positions; a point that the cell already holds as final keeps its own
-    final : (n,) registration final
+    origin : (n, 3) registered positions, geocentric metres
     point : (r,) row of each ray's point in ``point_ids``; image : (r,) row of the network's images
-    observed, sigma : (r, 2), pixels; accepted : (r,)
+    observed, sigma : (r, 2)
     """
 
     point_ids: Ids
     origin: Array
-    final: NDArray[np.bool_]
     point: Index
     image: Index
     observed: Array
     sigma: Array
-    accepted: NDArray[np.bool_]
 
 
 def empty_sums(images: int, parameters: int) -> Sums:
@@ -88,21 +80,18 @@ def empty_cell(number: int, parameters: int) -> Cell:
     none = np.empty(0, dtype=np.int32)
     rays = Rays(none, none, np.empty((0, 2)), np.empty((0, 2)), np.empty(0, dtype=np.bool_))
     return Cell(
-        number, np.empty(0, dtype="U1"), np.empty((0, 3)), np.empty((0, 3)), np.empty(0, dtype=np.bool_),
+        number, np.empty(0, dtype="U1"), np.empty((0, 3)), np.empty((0, 3)),
         none, np.empty((0, parameters)), rays, empty_sums(0, parameters),
     )  # fmt: skip
 
 
-def with_rays(cell: Cell, new: NewRays) -> Cell:
-    """The cell with more rays. Its sums are *not* those of its rays until `summed` is called."""
+def with_points(cell: Cell, new: RegisteredPoints) -> Cell:
+    """The cell with more points, none of which it holds yet. Its sums are *not* those of its rays until `summed` is called."""
     ids = np.union1d(cell.point_ids, new.point_ids)
     old_rows, new_rows = np.searchsorted(ids, cell.point_ids), np.searchsorted(ids, new.point_ids)
     origin, linearised_at = np.empty((len(ids), 3)), np.empty((len(ids), 3))
-    final = np.zeros(len(ids), dtype=np.bool_)
-    origin[new_rows], linearised_at[new_rows], final[new_rows] = new.origin, new.origin, new.final
-    kept = cell.final | ~np.isin(cell.point_ids, new.point_ids)
-    origin[old_rows[kept]], linearised_at[old_rows[kept]] = cell.origin[kept], cell.linearised_at[kept]
-    final[old_rows] |= cell.final
+    origin[old_rows], linearised_at[old_rows] = cell.origin, cell.linearised_at
+    origin[new_rows] = linearised_at[new_rows] = new.origin
 
     images = np.union1d(cell.images, new.image).astype(np.int32)
     theta = np.zeros((len(images), cell.theta.shape[1]))
@@ -112,22 +101,20 @@ def with_rays(cell: Cell, new: NewRays) -> Cell:
         np.searchsorted(images, np.concatenate([cell.images[cell.rays.image], new.image])).astype(np.int32),
         np.concatenate([cell.rays.observed, new.observed]),
         np.concatenate([cell.rays.sigma, new.sigma]),
-        np.concatenate([cell.rays.accepted, new.accepted]),
+        np.concatenate([cell.rays.accepted, np.ones(len(new.image), dtype=np.bool_)]),
     )
-    return replace(
-        cell, point_ids=ids, origin=origin, linearised_at=linearised_at, final=final, images=images, theta=theta, rays=rays
-    )  # fmt: skip
+    return replace(cell, point_ids=ids, origin=origin, linearised_at=linearised_at, images=images, theta=theta, rays=rays)
 
 
 def without_points(cell: Cell, point_ids: Ids) -> Cell:
-    """The cell without some points and their rays (points whose provisional registration has moved elsewhere). Sums as in `with_rays`."""
+    """The cell without some points and their rays. Sums as in `with_points`."""
     keep = ~np.isin(cell.point_ids, point_ids)
     row = np.cumsum(keep) - 1
     rays = cell.rays.take(keep[cell.rays.point])
     images, image = np.unique(rays.image, return_inverse=True)
     return replace(
         cell,
-        point_ids=cell.point_ids[keep], origin=cell.origin[keep], linearised_at=cell.linearised_at[keep], final=cell.final[keep],
+        point_ids=cell.point_ids[keep], origin=cell.origin[keep], linearised_at=cell.linearised_at[keep],
         images=cell.images[images], theta=cell.theta[images],
         rays=replace(rays, point=row[rays.point].astype(np.int32), image=image.astype(np.int32)),
     )  # fmt: skip
@@ -159,16 +146,6 @@ def factors(cell: Cell, images: ImageSet, points: NDArray[np.int64]) -> tuple[Li
     return linear, point_factors(linear, weight)
 
 
-def second_order(cell: Cell, images: ImageSet, theta: Array, ground: Array) -> float:
-    """Largest difference, in pixels, between linear and exact predictions of the cell's accepted rays at a new state (m, p), (n, 3)."""
-    if not cell.rays.accepted.any():
-        return 0.0
-    linear = linear_rays(cell, images)
-    exact = linearise(images, cell.rays, theta, ground, ground)
-    difference = residuals_of(linear, theta, ground - cell.origin) - residuals_of(exact, theta, np.zeros_like(ground))
-    return float(np.abs(difference * cell.rays.sigma)[cell.rays.accepted].max())
-
-
 def union_of_images(cells: Sequence[Cell]) -> Index:
     """Rows of the network's images that any of these cells sees, ascending."""
     if not cells:
@@ -176,14 +153,30 @@ def union_of_images(cells: Sequence[Cell]) -> Index:
     return np.unique(np.concatenate([cell.images for cell in cells])).astype(np.int32)
 
 
-def bundle(cells: Sequence[Cell], images: Index) -> tuple[Rays, Array]:
-    """All rays of some cells as one bundle: rays with rows of ``images``, points in the order of the cells, and their origins (n, 3)."""
+@dataclass(frozen=True)
+class Bundle:
+    """All rays of some cells, to be adjusted together, in an order that does not depend on when anything came.
+
+    Attributes
+    ----------
+    rays : candidates all, in canonical order; ``point`` counts the points of the cells one after another
+    origin : (n, 3) registered positions of the points
+    row : (r,) place of each ray among the rays of the cells one after another
+    """
+
+    rays: Rays
+    origin: Array
+    row: NDArray[np.int64]
+
+
+def bundle(cells: Sequence[Cell], images: Index) -> Bundle:
+    """Bundle the rays of some cells; ``images`` (rows of the network, in any order) are those of the bundle."""
     shifts = np.cumsum([0, *(len(cell) for cell in cells)])
-    rays = Rays(
-        np.concatenate([cell.rays.point + shift for cell, shift in zip(cells, shifts, strict=False)]).astype(np.int32),
-        np.concatenate([np.searchsorted(images, cell.images)[cell.rays.image] for cell in cells]).astype(np.int32),
-        np.concatenate([cell.rays.observed for cell in cells]),
-        np.concatenate([cell.rays.sigma for cell in cells]),
-        np.concatenate([cell.rays.accepted for cell in cells]),
-    )
-    return rays, np.concatenate([cell.origin for cell in cells])
+    place = np.argsort(images)
+    point = np.concatenate([cell.rays.point + shift for cell, shift in zip(cells, shifts, strict=False)]).astype(np.int32)
+    image = np.concatenate([place[np.searchsorted(images, cell.images, sorter=place)][cell.rays.image] for cell in cells]).astype(np.int32)
+    observed = np.concatenate([cell.rays.observed for cell in cells])
+    row = np.lexsort((observed[:, 1], observed[:, 0], image, point))
+    sigma = np.concatenate([cell.rays.sigma for cell in cells])
+    rays = Rays(point[row], image[row], observed[row], sigma[row], np.ones(len(row), dtype=np.bool_))
+    return Bundle(rays, np.concatenate([cell.origin for cell in cells]), row)

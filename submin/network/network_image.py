@@ -26,7 +26,7 @@ class NetworkImage:
     camera : catalogue description, JSON text
     width, height : pixels
     seconds : time of acquisition, seconds since 1970; NaN when unknown
-    a_priori : JSON text of the a priori model of its block
+    a_priori : JSON text of the a priori model of its block; empty for an image that has nothing to adjust
     released : True once its camera was found to be bad and its prior given up
     """
 
@@ -48,8 +48,8 @@ def _packed(sensor: str, camera: str, width: int, height: int) -> NDArray[np.flo
 
 
 @lru_cache(maxsize=256)
-def _a_priori(text: str) -> APriori:
-    return APriori.from_mapping(json.loads(text))
+def _a_priori(text: str) -> APriori | None:
+    return APriori.from_mapping(json.loads(text)) if text else None
 
 
 def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: int = WIDEST) -> ImageSet:

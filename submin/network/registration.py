@@ -1,12 +1,12 @@
-"""Registration: every new point gets an approximate position, and with it its one cell, from all the rays that it then has.
+"""Registration: every point gets an approximate position, and with it its one cell, from all the rays that it has.
 
-Registration is provisional while a point has fewer than two accepted rays, and final from then on, wherever the estimate moves later
-(docs/mathematics.md, "Registration"). Unadjusted cameras: the result does not depend on the network's state.
+A point that gets or loses a ray is taken out of its cell and put back with the rays that it then has. Unadjusted cameras, images in the
+order of their ids: where a point is registered depends on its rays alone, not on when they came (decision 006).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,138 +16,124 @@ from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
 from submin.geodesy import geocentric_to_geodetic
-from submin.network.cell import Cell, NewRays
+from submin.network.cell import Cell, RegisteredPoints
 from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.str_]
+Flags = NDArray[np.bool_]
 
 SAME_POINT_METRES = 1000.0
 """Rays of one point id that pass each other by more than this belong to two places."""
+IN_THE_NETWORK = -1
+"""Block of a ray that the network has already."""
 
 
 @dataclass(frozen=True)
-class ArrivingRays:
-    """Rays of a batch of blocks, in any order.
+class LooseRays:
+    """Rays that lie in no cell, in any order: those of new blocks, and those of points taken out of their cells.
 
     Attributes
     ----------
     point_ids : (r,) ids of the points; image : (r,) row of the network's images
-    observed, sigma : (r, 2) pixels; accepted : (r,) as stage 1 left them
-    block : (r,) number of each ray's block within the batch
+    observed, sigma : (r, 2)
+    block : (r,) number of each ray's block within its batch; `IN_THE_NETWORK` for a ray taken out of a cell
     """
 
     point_ids: Ids
     image: NDArray[np.int32]
     observed: Array
     sigma: Array
-    accepted: NDArray[np.bool_]
     block: NDArray[np.int32]
 
-    def of_blocks(self, keep: NDArray[np.bool_]) -> ArrivingRays:
-        """The rays of the blocks to be kept (True by block number)."""
-        rows = keep[self.block]
-        return ArrivingRays(
-            self.point_ids[rows], self.image[rows], self.observed[rows], self.sigma[rows], self.accepted[rows], self.block[rows]
-        )  # fmt: skip
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def take(self, rows: Flags) -> LooseRays:
+        """The rays where ``rows`` (r,) is True."""
+        return LooseRays(self.point_ids[rows], self.image[rows], self.observed[rows], self.sigma[rows], self.block[rows])
+
+
+def together(parts: Sequence[LooseRays]) -> LooseRays:
+    """All rays of some parts."""
+    none = np.empty(0, dtype=np.int32)
+    empty = LooseRays(np.empty(0, dtype="U1"), none, np.empty((0, 2)), np.empty((0, 2)), none)
+    names = ("point_ids", "image", "observed", "sigma", "block")
+    return LooseRays(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in names))
+
+
+def taken_out(cell: Cell, points: Flags) -> LooseRays:
+    """The rays of those of a cell's points where ``points`` (n,) is True."""
+    rays = cell.rays.take(points[cell.rays.point])
+    block = np.full(len(rays), IN_THE_NETWORK, dtype=np.int32)
+    return LooseRays(cell.point_ids[rays.point], cell.images[rays.image], rays.observed, rays.sigma, block)
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Where the rays of a batch go.
+    """Where points go.
 
     Attributes
     ----------
-    arrivals : new rays (and those that move along with a provisional point) by cell
-    departures : ids of the points that leave a cell, by cell
-    directory : ids and cells of points that are new or have moved
-    misfit : (r,) metres by which each arriving ray passes the place of its point
+    arrivals : points by cell, with all of their rays
+    directory : ids and cells of all points
+    apart : (r,) metres between the two places that those rays of a ray's point give which disagree most; infinite where none is reached
     outside : (r,) True for rays on points outside the cover's rectangle
     """
 
-    arrivals: dict[int, NewRays]
-    departures: dict[int, Ids]
+    arrivals: dict[int, RegisteredPoints]
     directory: tuple[Ids, NDArray[np.int64]]
-    misfit: Array
-    outside: NDArray[np.bool_]
+    apart: Array
+    outside: Flags
 
 
-def register(
-    rays: ArrivingRays, images: ImageSet, image_rows: NDArray[np.int32], known: NDArray[np.int64], cells: Mapping[int, Cell], cover: Cover
-) -> Registration:
-    """Register the points of arriving rays.
+def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cover: Cover) -> Registration:
+    """Register the points of some rays, which are all rays that these points have.
 
-    Parameters
-    ----------
-    images : the images of the arriving rays and of the rays of provisional points; ``image_rows`` : their rows in the network, ascending
-    known : (u,) for each *unique* point id (as `numpy.unique` orders them) the cell that may hold it, -1 for none
-    cells : those cells, as they are before the batch
+    ``images`` are at least those of the rays, ``image_rows`` their rows in the network, ascending.
     """
     ids, point = np.unique(rays.point_ids, return_inverse=True)
-    count = len(ids)
-    origin, final, at = np.full((count, 3), np.nan), np.zeros(count, dtype=np.bool_), np.full(count, -1, dtype=np.int64)
-    carried: list[tuple[NDArray[np.int64], Cell, NDArray[np.int64]]] = []
-    for number in np.unique(known[known >= 0]):
-        cell = cells[int(number)]
-        here = np.flatnonzero(known == number)
-        row = np.searchsorted(cell.point_ids, ids[here])
-        held = row < len(cell.point_ids)
-        held[held] = cell.point_ids[row[held]] == ids[here[held]]
-        here, row = here[held], row[held]
-        at[here], final[here], origin[here] = number, cell.final[row], cell.origin[row]
-        provisional = ~cell.final[row]
-        if provisional.any():
-            to_point = np.full(len(cell.point_ids), -1, dtype=np.int64)
-            to_point[row[provisional]] = here[provisional]
-            chosen = np.flatnonzero(to_point[cell.rays.point] >= 0)
-            carried.append((to_point[cell.rays.point[chosen]], cell, chosen))
+    if not len(rays):
+        return Registration({}, (ids, np.empty(0, dtype=np.int64)), np.empty(0), np.empty(0, dtype=np.bool_))
+    named = np.argsort(np.array(images.ids, dtype=np.str_))
+    rank = np.empty(len(named), dtype=np.int32)
+    rank[named] = np.arange(len(named))
+    images = images.take(named)
+    local = rank[np.searchsorted(image_rows, rays.image)]
 
-    old_point = np.concatenate([c[0] for c in carried]) if carried else np.empty(0, dtype=np.int64)
-    old_cell = np.concatenate([np.full(len(r), c.number) for _, c, r in carried]) if carried else np.empty(0, dtype=np.int64)
-    every_point = np.concatenate([point, old_point])
-    every_image = np.concatenate([rays.image, *(c.images[c.rays.image[r]] for _, c, r in carried)]).astype(np.int32)
-    observed = np.concatenate([rays.observed, *(c.rays.observed[r] for _, c, r in carried)])
-    sigma = np.concatenate([rays.sigma, *(c.rays.sigma[r] for _, c, r in carried)])
-    accepted = np.concatenate([rays.accepted, *(c.rays.accepted[r] for _, c, r in carried)])
-    local = np.searchsorted(image_rows, every_image).astype(np.int32)
-
-    fresh = ~final
-    before = at.copy()
-    if fresh.any():
-        compact = np.cumsum(fresh) - 1
-        chosen = fresh[every_point]
-        bundle = sorted_rays(
-            compact[every_point[chosen]].astype(np.int32), local[chosen], observed[chosen], sigma[chosen], accepted[chosen]
-        )
-        origin[fresh] = intersect(images, bundle, int(fresh.sum())).geocentric
-        final[fresh] = np.bincount(every_point[accepted], minlength=count)[fresh] >= 2
-    reached = np.isfinite(origin).all(axis=1)
-    geodetic = np.full((count, 3), np.nan)
-    geodetic[reached] = geocentric_to_geodetic(origin[reached], cover.ellipsoid)
-    moving = fresh & reached
-    at[moving] = cover.cells_of(geodetic[moving, 0], geodetic[moving, 1])
-
+    every = np.ones(len(rays), dtype=np.bool_)
+    origin = intersect(images, sorted_rays(point.astype(np.int32), local, rays.observed, rays.sigma, every), len(ids)).geocentric
+    reached: Flags = np.asarray(np.isfinite(origin).all(axis=1))
+    at = np.full(len(ids), -1, dtype=np.int64)
+    outside: Flags = np.zeros(len(ids), dtype=np.bool_)
+    geodetic = geocentric_to_geodetic(origin[reached], cover.ellipsoid)
+    at[reached] = cover.cells_of(geodetic[:, 0], geodetic[:, 1])
+    outside[reached] = cover.outside(geodetic[:, 0], geodetic[:, 1])
     misfit = np.full(len(point), np.inf)
     usable = reached[point]
-    misfit[usable] = _misfit(images, local[: len(point)][usable], rays.observed[usable], origin[point[usable]])
-    outside = np.zeros(len(point), dtype=np.bool_)
-    outside[usable] = cover.outside(geodetic[point[usable], 0], geodetic[point[usable], 1])
+    misfit[usable] = _misfit(images, local[usable], rays.observed[usable], origin[point[usable]])
+    apart = _two_largest(misfit, point, len(ids))
 
-    # old rays stay where they are unless their point has moved to another cell
-    goes = np.concatenate([np.ones(len(point), dtype=np.bool_), at[old_point] != old_cell])
-    arrivals: dict[int, NewRays] = {}
-    goes &= at[every_point] >= 0
-    for number in np.unique(at[every_point[goes]]):
-        chosen_rays = np.flatnonzero(goes & (at[every_point] == number))
-        members, row = np.unique(every_point[chosen_rays], return_inverse=True)
-        arrivals[int(number)] = NewRays(
-            ids[members], origin[members], final[members], row.astype(np.int32), every_image[chosen_rays],
-            observed[chosen_rays], sigma[chosen_rays], accepted[chosen_rays],
-        )  # fmt: skip
-    moved = (before >= 0) & (before != at)
-    departures = {int(number): ids[moved & (before == number)] for number in np.unique(before[moved])}
-    listed = (before != at) & (at >= 0)
-    return Registration(arrivals, departures, (ids[listed], at[listed]), misfit, outside)
+    arrivals: dict[int, RegisteredPoints] = {}
+    order = np.lexsort((np.arange(len(point)), at[point]))  # rays by cell: one pass however many cells
+    cells, start = np.unique(at[point[order]], return_index=True)
+    for number, rows in zip(cells.tolist(), np.split(order, start[1:]), strict=True):
+        if number >= 0:
+            members, row = np.unique(point[rows], return_inverse=True)
+            arrivals[number] = RegisteredPoints(
+                ids[members], origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
+            )
+    return Registration(arrivals, (ids, at), apart[point], outside[point])
+
+
+def _two_largest(values: Array, point: NDArray[np.int64], points: int) -> Array:
+    """Sum (n,) of the two largest values of each point: rays of two places d apart pass their common point by d together."""
+    order = np.lexsort((-values, point))
+    first = np.searchsorted(point[order], np.arange(points))
+    total = values[order[first]].copy()
+    several = np.flatnonzero(np.diff(np.append(first, len(point))) > 1)
+    total[several] += values[order[first[several] + 1]]
+    return total
 
 
 def _misfit(images: ImageSet, image: NDArray[np.int32], observed: Array, ground: Array) -> Array:

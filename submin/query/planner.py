@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -207,9 +208,11 @@ def _choose(source: NetworkSource, selections: Sequence[Selection], policy: str,
         at = np.concatenate([s.cell.linearised_at[s.rows] for s in selections])
         geodetic = geocentric_to_geodetic(at, cover.ellipsoid)
         depth = {t: float(cover.depth(t, geodetic[:, 0], geodetic[:, 1]).min()) for t in all_hold}
-        owned = np.bincount([cover.owner(s.cell.number) for s in selections], weights=[len(s.rows) for s in selections])
+        owned = Counter[int]()
+        for s in selections:
+            owned[cover.owner(s.cell.number)] += len(s.rows)
         # the tile whose core holds most of the query; ties to the largest interior depth
-        best = max(sorted(all_hold), key=lambda t: (owned[t] if t < len(owned) else 0.0, depth[t]))
+        best = max(sorted(all_hold), key=lambda t: (owned[t], depth[t]))
         return "tile", [best]
     if policy == "tile":
         raise QueryError("no one tile holds all queried points; use policy 'rigorous' or 'auto', a smaller area, or name a tile")

@@ -3,10 +3,11 @@
 from submin.errors import InputError
 from submin.sensors.base import Ground, Projection, Sensor
 from submin.sensors.rpc import RpcSensor
+from submin.sensors.survey import SurveySensor
 
-SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in (RpcSensor(),)}
+SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in (RpcSensor(), SurveySensor())}
 
-WIDEST = max(sensor.parameters for sensor in SENSORS.values())
+WIDEST = max(len(sensor.parameters) for sensor in SENSORS.values())
 """Adjustable parameters of the sensor that has most of them; images of the others are padded with parameters of zero partial."""
 
 

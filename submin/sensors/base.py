@@ -61,10 +61,12 @@ class Sensor(Protocol):
     """A sensor model. ``name`` is the word in the column ``sensor`` of a catalogue."""
 
     name: str
-    parameters: int
-    """Number of adjustable parameters of an image."""
-    bias: tuple[int, int]
-    """Places of the two parameters that shift the whole image in sample and line: the ones that images of a pass can share."""
+    unit: str
+    """In which image coordinates are measured: ``pixel`` or ``metre``."""
+    parameters: tuple[str, ...]
+    """What each adjustable parameter of an image is, for people."""
+    bias: tuple[int, ...]
+    """Places of the parameters that shift the whole image in sample and line: the ones that images of a pass can share."""
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
         """Row of numbers that describes one camera, from its catalogue description; raises `InputError` when it is incomplete."""

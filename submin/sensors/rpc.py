@@ -152,8 +152,12 @@ class RpcSensor:
     """The RPC sensor with shift and affine drift in image space (see the module for the model and the order of parameters)."""
 
     name = "rpc"
-    parameters = 6
-    bias = (0, 3)
+    unit = "pixel"
+    parameters: tuple[str, ...] = (
+        "sample bias", "sample drift along samples", "sample drift along lines",
+        "line bias", "line drift along samples", "line drift along lines",
+    )  # fmt: skip
+    bias: tuple[int, ...] = (0, 3)
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
         """Packed camera (94,) of a description: GDAL's RPC names, and ``origin``, the (sample, line) of the image's first pixel.

@@ -487,8 +487,8 @@ def _tie_points(design: RegionDesign, rng: np.random.Generator) -> tuple[Ids, Ar
 
 def _true_parameters(design: RegionDesign, images: Sequence[SimulatedImage], rng: np.random.Generator) -> tuple[Array, Index]:
     """True parameters (m, 6) drawn from the a priori model, and the places of the bad cameras."""
-    factor = prior_factor(image_priors(images, design.priors), SENSOR.parameters)
-    theta = (factor @ rng.standard_normal(factor.shape[1])).reshape(len(images), SENSOR.parameters)
+    factor = prior_factor(image_priors(images, design.priors), len(SENSOR.parameters))
+    theta = (factor @ rng.standard_normal(factor.shape[1])).reshape(len(images), len(SENSOR.parameters))
     bad = np.sort(rng.choice(len(images), design.bad_cameras, replace=False)).astype(np.int32)
     direction = rng.uniform(0.0, 2.0 * np.pi, design.bad_cameras)
     shift = design.bad_camera_sigmas * design.priors.bias_px * np.stack([np.cos(direction), np.sin(direction)], axis=1)

@@ -233,7 +233,7 @@ class Block:
     ----------
     block_id : str
     images : its m images, in catalogue order
-    a_priori : what is believed of their cameras before any measurement
+    a_priori : what is believed of their cameras before any measurement; None when they have nothing to adjust
     point_ids : (r,) ground point of each ray
     image : (r,) index into ``images``
     sample, line : (r,) measured image coordinates, pixels
@@ -242,7 +242,7 @@ class Block:
 
     block_id: str
     images: tuple[ImageRecord, ...]
-    a_priori: APriori
+    a_priori: APriori | None
     point_ids: Ids
     image: Index
     sample: Array
@@ -274,7 +274,7 @@ class Block:
         rays = np.lexsort((*measured[::-1], rank[self.image], point))
         head = {
             "images": [self.images[i]._content for i in order],
-            "a_priori": self.a_priori.to_mapping(),
+            "a_priori": None if self.a_priori is None else self.a_priori.to_mapping(),
             "points": points.tolist(),
         }
         digest = hashlib.blake2b(json.dumps(head, sort_keys=True).encode(), digest_size=32)
@@ -310,7 +310,7 @@ def defects(block: Block) -> str | None:
     counts = np.bincount(block.image, minlength=len(block.images))
     if (counts == 0).any():
         return f"image {block.images[int(np.argmin(counts))].image_id} has no measurements; expected some in every image of the block"
-    if block.a_priori.correlation in ("exponential", "gaussian"):
+    if block.a_priori is not None and block.a_priori.correlation in ("exponential", "gaussian"):
         for image in block.images:
             if not image.acquired:
                 model = block.a_priori.correlation

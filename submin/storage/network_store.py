@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -32,17 +33,19 @@ from submin.tiling.cover import Cover
 
 icechunk.set_logs_filter("icechunk=error")
 BRANCH = "main"
+_TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
 READ_OVER_ROWS = 256
 
 
 @dataclass(frozen=True)
 class Version:
-    """One version of a network: its number, the snapshot that holds it, when and with what message it was committed."""
+    """One version of a network: its number, the snapshot that holds it, when and with what message it was committed, its tags."""
 
     number: int
     snapshot: str
     written: datetime
     message: str
+    tags: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -97,26 +100,64 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
 def versions(place: str) -> list[Version]:
     """All versions of a network, the newest first."""
     repository = _open_repository(place)
+    tags: dict[str, list[str]] = {}
+    for tag in sorted(repository.list_tags()):
+        tags.setdefault(repository.lookup_tag(tag), []).append(tag)
     return [
-        Version(int(a.metadata["version"]), a.id, a.written_at, a.message)
+        Version(int(a.metadata["version"]), a.id, a.written_at, a.message, tuple(tags.get(a.id, ())))
         for a in repository.ancestry(branch=BRANCH)
         if "version" in a.metadata
     ]
 
 
+def find_version(place: str, name: str) -> Version:
+    """The version of a name (``v12``) or tag.
+
+    Raises
+    ------
+    QueryError
+        When there is none.
+    """
+    known = versions(place)
+    for version in known:
+        if name == version.name or name in version.tags:
+            return version
+    tags = "".join(f", {tag}" for version in known for tag in version.tags)
+    raise QueryError(f"version is {name!r}; expected one of v0 to {known[0].name}{tags} (see 'submin history')")
+
+
+def tag_version(place: str, tag: str, name: str | None = None) -> Version:
+    """Give a version, by default the newest, a name that stays.
+
+    Raises
+    ------
+    StoreError
+        When the tag is taken, is no word, or would hide a version's own name.
+    """
+    if not _TAG.fullmatch(tag) or _OWN_NAME.fullmatch(tag):
+        raise StoreError(f"tag is {tag!r}; expected a word of letters, digits, '.', '_' and '-' that is no version's own name such as v12")
+    version = versions(place)[0] if name is None else find_version(place, name)
+    try:
+        _open_repository(place).create_tag(tag, snapshot_id=version.snapshot)
+    except icechunk.IcechunkError as error:
+        raise StoreError(f"{place}: tag {tag!r} cannot be made ({str(error).strip().splitlines()[0]}); a tag is given once") from None
+    return replace(version, tags=(*version.tags, tag))
+
+
 class Snapshot:
     """One version of a network, read only. Everything is read when asked for; nothing is kept but small tables."""
 
-    def __init__(self, root: zarr.Group, place: str) -> None:
+    def __init__(self, root: zarr.Group, place: str, cover: Cover | None = None) -> None:
+        """``cover`` is that of the version being made, where it has finer tiles than the one in the store."""
         self.root = root
         self.place = place
         self.metadata = NetworkMetadata.from_attributes(attributes_of(root), place)
-        self.cover = Cover.from_mapping(self.metadata.cover)
+        self.cover = Cover.from_mapping(self.metadata.cover) if cover is None else cover
         self.number = int(attributes_of(root)["version"])
 
     @classmethod
     def open(cls, place: str, version: str | None = None) -> Snapshot:
-        """Open the newest version, or the one named (``v12``).
+        """Open the newest version, or the one named (``v12``, or a tag).
 
         Raises
         ------
@@ -127,11 +168,7 @@ class Snapshot:
         if version is None:
             session = repository.readonly_session(BRANCH)
         else:
-            known = versions(place)
-            found = [v for v in known if v.name == version]
-            if not found:
-                raise QueryError(f"version is {version!r}; expected one of v0 to {known[0].name} (see 'submin history')")
-            session = repository.readonly_session(snapshot_id=found[0].snapshot)
+            session = repository.readonly_session(snapshot_id=find_version(place, version).snapshot)
         try:
             return cls(zarr.open_group(session.store, mode="r"), place)
         except FileNotFoundError:
@@ -234,6 +271,9 @@ def commit(session: icechunk.Session, version: int, message: str) -> None:
         ) from None
 
 
-def writable_session(place: str) -> icechunk.Session:
-    """A session in which to write the next version."""
-    return _open_repository(place).writable_session(BRANCH)
+def begin_change(place: str) -> tuple[icechunk.Session, Snapshot]:
+    """A session in which to write the next version, and the version that it starts from, which what is written does not change."""
+    repository = _open_repository(place)
+    session = repository.writable_session(BRANCH)
+    base = repository.readonly_session(snapshot_id=session.snapshot_id)
+    return session, Snapshot(zarr.open_group(base.store, mode="r"), place)

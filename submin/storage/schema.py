@@ -19,14 +19,15 @@ from submin.network.cell import Cell
 from submin.network.network_image import NetworkImage
 from submin.network.sub_min import SubMin
 from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
+from submin.storage.catalogue_schema import ImageRecord
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 COVARIANCE_CHUNK = 256
 
 IMAGE_COLUMNS = {
     "image_id": "text", "block_id": "text", "pass_id": "text", "platform": "text", "sensor": "text", "camera": "text",
     "width": "int64", "height": "int64", "acquired": "text", "seconds": "float64", "footprint": "text", "licence": "text",
-    "a_priori": "text", "released": "uint8",
+    "a_priori": "text", "released": "uint8", "withdrawn": "uint8",
 }  # fmt: skip
 LEDGER_COLUMNS = {
     "block_id": "text", "content": "text", "status": "text", "reason": "text", "version": "int64",
@@ -39,7 +40,7 @@ DIRECTORY_COLUMNS = {"hash": "uint64", "cell": "int64"}
 
 @dataclass(frozen=True)
 class NetworkMetadata:
-    """What is fixed when a network is created.
+    """What is fixed when a network is created, and its cover, which later versions may refine.
 
     Attributes
     ----------
@@ -48,6 +49,7 @@ class NetworkMetadata:
     cover : description of the cover, see `Cover.to_mapping`
     form : ``factored``
     parameters : adjustable parameters kept for each image
+    max_parameters : a tile that would hold more image parameters is split, where its overlap lets it
     format_version : of the store
     """
 
@@ -60,6 +62,7 @@ class NetworkMetadata:
     cover: dict[str, Any]
     form: str = "factored"
     parameters: int = 6
+    max_parameters: int = 2500
     format_version: int = FORMAT_VERSION
 
     @property
@@ -98,19 +101,22 @@ def unpack_lower(packed: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
-def write_cell(root: zarr.Group, name: str, cell: Cell, square_px: float) -> None:
-    """Write a cell, replacing its earlier state; ``square_px`` is the sum of its accepted rays' squared residuals, pixels squared."""
+def write_cell(root: zarr.Group, name: str, cell: Cell, square_px: float, pixel_rays: int) -> None:
+    """Write a cell, replacing its earlier state.
+
+    ``square_px`` is the sum of the squared residuals, pixels squared, of its ``pixel_rays`` accepted rays that are measured in pixels.
+    """
     rays, sums = cell.rays, cell.sums
     write_record(
         group_of(root, "cells"), name,
         {
-            "point_ids": cell.point_ids, "final": cell.final, "ray_point": rays.point, "ray_image": rays.image, "accepted": rays.accepted,
+            "point_ids": cell.point_ids, "ray_point": rays.point, "ray_image": rays.image, "accepted": rays.accepted,
             "images": cell.images, "origin": cell.origin, "linearised_at": cell.linearised_at, "theta": cell.theta,
             "observed": rays.observed, "sigma": rays.sigma, "vector": sums.vector, "information": pack_lower(sums.information),
         },
         {"number": cell.number, "misclosure": sums.misclosure, "redundancy": sums.redundancy,
          "points": len(cell.point_ids), "determined": int(determined(cell).sum()), "rays": len(rays), "accepted": int(rays.accepted.sum()),
-         "square_px": square_px},
+         "square_px": square_px, "pixel_rays": pixel_rays},
     )  # fmt: skip
 
 
@@ -122,7 +128,7 @@ def determined(cell: Cell) -> NDArray[np.bool_]:
 def read_cell(group: zarr.Group, *, with_sums: bool = True) -> Cell:
     """The cell of a record; without sums (left empty) the large part is not read."""
     wanted = [
-        "point_ids", "final", "ray_point", "ray_image", "accepted", "images", "origin", "linearised_at", "theta", "observed", "sigma",
+        "point_ids", "ray_point", "ray_image", "accepted", "images", "origin", "linearised_at", "theta", "observed", "sigma",
     ]  # fmt: skip
     parts = read_record(group, None if with_sums else wanted)
     rays = Rays(
@@ -131,7 +137,7 @@ def read_cell(group: zarr.Group, *, with_sums: bool = True) -> Cell:
     )  # fmt: skip
     sums = read_sums_of(group, parts) if with_sums else Sums(np.empty((0, 0)), np.empty(0), 0.0, 0)
     return Cell(
-        int(attributes_of(group)["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"], parts["final"].astype(np.bool_),
+        int(attributes_of(group)["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"],
         parts["images"].astype(np.int32), parts["theta"], rays, sums,
     )  # fmt: skip
 
@@ -170,6 +176,21 @@ def read_sub_min(group: zarr.Group, images: NDArray[np.int32] | None = None) -> 
         held[chosen], theta[chosen], fill_symmetric(np.ascontiguousarray(covariance)),
         float(attributes["chi_square"]), int(attributes["redundancy"]),
     )  # fmt: skip
+
+
+def image_columns(images: Sequence[NetworkImage], records: Sequence[ImageRecord]) -> dict[str, NDArray[Any]]:
+    """Columns of the image table for new images and their catalogue records."""
+    texts = {
+        **{name: [getattr(i, name) for i in images] for name in ("image_id", "block_id", "pass_id", "sensor", "camera", "a_priori")},
+        **{name: [getattr(r, name) for r in records] for name in ("platform", "acquired", "licence")},
+        "footprint": [r.footprint.hex() for r in records],
+    }
+    none = np.zeros(len(images), dtype=np.uint8)
+    return {
+        **{name: np.array(values, dtype=np.str_) for name, values in texts.items()},
+        "width": np.array([i.width for i in images], dtype=np.int64), "height": np.array([i.height for i in images], dtype=np.int64),
+        "seconds": np.array([i.seconds for i in images], dtype=np.float64), "released": none, "withdrawn": none,
+    }  # fmt: skip
 
 
 def network_images(columns: dict[str, NDArray[Any]]) -> list[NetworkImage]:

@@ -1,19 +1,21 @@
 """Cover of an area by overlapping tiles, and the cells that their outlines cut.
 
 The area is laid out in metres in a Lambert azimuthal equal-area frame about its middle. *Cores* of one size tile the whole plane: those
-on the rim of
-the grid reach to infinity, so every position has exactly one owner. A tile is its core, widened on each side by half the overlap. The
-outlines cut the plane into *cells*: all positions with the same owner and the same set of tiles that hold them. With an overlap below the
-core's side a core has nine: its interior, four edges, four corners (docs/mathematics.md, "Cells").
+on the rim of the grid reach to infinity, so every position has exactly one owner. A core that has to hold too much is split into four
+(decision 008). A tile is its core, widened on each side by half the overlap. The outlines cut the plane into *cells*: all positions with
+the same owner and the same set of tiles that hold them. Among cores of one size, with an overlap below their side, a core has nine: its
+interior, four edges, four corners (docs/mathematics.md, "Cells").
 
-Tiles are named ``r003c007`` (row from the south, column from the west), cells ``r003c007-ne``: the owner and the part of its core.
+Tiles are named ``r003c007`` (row from the south, column from the west), quarters of a split core ``r003c007q0`` to ``q3`` (south-west,
+south-east, north-west, north-east), their quarters ``r003c007q02``. A cell is named by the tiles that hold it, its owner first:
+``r003c007+r003c008``.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -30,10 +32,13 @@ Array = NDArray[np.float64]
 Codes = NDArray[np.int64]
 
 MAX_TILES = 1_000_000
-PARTS = ("sw", "s", "se", "w", "c", "e", "nw", "n", "ne")
-"""Parts of a core, by (north-south, west-east) place: index 3 * i + j with i, j = 0, 1, 2 from the south-west."""
+MAX_LEVEL = 12
+"""A core may be halved so often: to a four-thousandth of its side."""
+ZONES = 5
+"""Strips of a core along one axis, between its sides, half an overlap inside them, and half an overlap around its middle, where smaller
+neighbours meet: no outline of another tile crosses a zone."""
 
-_TILE_NAME = re.compile(r"r(\d{3,})c(\d{3,})")
+_TILE_NAME = re.compile(r"r(\d{3,})c(\d{3,})(?:q([0-3]+))?")
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class Cover:
     core : side of a core, metres
     overlap : width that two neighbours share, metres, half on each side of the border of their cores
     ellipsoid : of the body
+    splits : tiles that were split into four, ascending; a tile that is listed here is none any more
 
     Raises
     ------
@@ -62,6 +68,7 @@ class Cover:
     core: float
     overlap: float
     ellipsoid: Ellipsoid = WGS84
+    splits: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.core) and self.core > 0.0):
@@ -98,20 +105,72 @@ class Cover:
         return np.asarray(lon, dtype=np.float64), np.asarray(lat, dtype=np.float64)
 
     def cells_of(self, longitude: Array, latitude: Array) -> Codes:
-        """Code (n,) of the cell of each position: ``9 * tile + part``. A position outside the area belongs to the nearest core."""
+        """Code (n,) of the cell of each position: its owner, and the zone of the owner's core. Outside the area the nearest core owns."""
         east, north = self.plane(longitude, latitude)
-        row, i = self._place(north - self.origin[1], self.rows)
-        column, j = self._place(east - self.origin[0], self.columns)
-        return 9 * (row * self.columns + column) + 3 * i + j
+        owner, west, south, side = self._leaves_at(east, north)
+        zone = ZONES * self._strip(north - south, side) + self._strip(east - west, side)
+        codes, inverse = np.unique(ZONES**2 * owner + zone, return_inverse=True)
+        cells = [ZONES**2 * tile + self._zones(tile)[0][at] for tile, at in (divmod(int(code), ZONES**2) for code in codes)]
+        return np.array(cells, dtype=np.int64)[inverse]
 
-    def _place(self, distance: Array, count: int) -> tuple[Codes, Codes]:
-        """Core along one axis, and 0, 1, 2 for the part shared with the core before it, with none, with the next."""
-        core = np.clip(np.floor(distance / self.core), 0, count - 1).astype(np.int64)
-        into, half = distance - core * self.core, 0.5 * self.overlap
-        part = np.ones(len(core), dtype=np.int64)
-        part[(into < half) & (core > 0)] = 0
-        part[(into >= self.core - half) & (core < count - 1)] = 2
-        return core, part
+    def _strip(self, into: Array, side: Array) -> Codes:
+        """Zone along one axis at a distance into cores of this side."""
+        return np.asarray((into >= np.stack(self._lines(side))).sum(axis=0), dtype=np.int64)
+
+    def _lines(self, side: Array | float) -> tuple[Array, Array, Array, Array]:
+        """Where the strips of cores of this side end, but the last. Half-size neighbours need quarters as wide as the overlap."""
+        half = np.full(np.shape(side), 0.5 * self.overlap)
+        can_meet = 0.5 * np.asarray(side) >= self.overlap
+        return half, np.where(can_meet, 0.5 * side - half, half), np.where(can_meet, 0.5 * side + half, half), side - half
+
+    def _leaves_at(self, east: Array, north: Array) -> tuple[Codes, Array, Array, Array]:
+        """Tile whose core holds each position (n,) of the plane, with the core's western and southern border and its side."""
+        row = np.clip(np.floor((north - self.origin[1]) / self.core), 0, self.rows - 1).astype(np.int64)
+        column = np.clip(np.floor((east - self.origin[0]) / self.core), 0, self.columns - 1).astype(np.int64)
+        tile, side = row * self.columns + column, np.full(row.shape, self.core, dtype=np.float64)
+        west = np.asarray(self.origin[0] + column * self.core, dtype=np.float64)
+        south = np.asarray(self.origin[1] + row * self.core, dtype=np.float64)
+        inside = np.flatnonzero(np.isin(tile, self.splits))
+        while len(inside):
+            side[inside] *= 0.5
+            right, up = east[inside] >= west[inside] + side[inside], north[inside] >= south[inside] + side[inside]
+            west[inside] += right * side[inside]
+            south[inside] += up * side[inside]
+            tile[inside] = self._base + 4 * tile[inside] + 2 * up + right
+            inside = inside[np.isin(tile[inside], self.splits)]
+        return tile, west, south, side
+
+    @property
+    def _base(self) -> int:
+        return self.rows * self.columns
+
+    @cached_property
+    def _zone_memory(self) -> dict[int, tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]]:
+        return {}
+
+    def _zones(self, tile: int) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...]]:
+        """For each zone of a core, the first zone with the same holders (they are one cell), and the holders, ascending.
+
+        Cores are at least as wide as the overlap. So a tile holds a position when its core holds one of the corners of the square of
+        half an overlap around it.
+        """
+        if tile not in self._zone_memory:
+            level, row, column = self._address(tile)
+            side, half = self.core / 2**level, 0.5 * self.overlap
+            lines = np.array([0.0, *self._lines(side), side], dtype=np.float64)
+            middle = 0.5 * (lines[:-1] + lines[1:])
+            y, x = np.meshgrid(self.origin[1] + row * side + middle, self.origin[0] + column * side + middle, indexing="ij")
+            corners = [self._leaves_at((x + dx).ravel(), (y + dy).ravel())[0] for dx in (-half, half) for dy in (-half, half)]
+            holders = tuple(tuple(sorted(set(at))) for at in zip(*(c.tolist() for c in corners), strict=True))
+            # a strip without width is no place, but what lies beyond the rim falls into the first or the last: its neighbour stands for it
+            wide = [k for k in range(ZONES) if lines[k + 1] > lines[k]]
+            stand = [min(wide, key=lambda w, k=k: abs(w - k)) for k in range(ZONES)]  # type: ignore[misc]
+            first: dict[tuple[int, ...], int] = {}
+            for z in (ZONES * i + j for i in wide for j in wide):
+                first.setdefault(holders[z], z)
+            of_zone = tuple(first[holders[ZONES * stand[i] + stand[j]]] for i in range(ZONES) for j in range(ZONES))
+            self._zone_memory[tile] = of_zone, holders
+        return self._zone_memory[tile]
 
     def outside(self, longitude: Array, latitude: Array) -> NDArray[np.bool_]:
         """True (n,) for positions outside the rectangle of the cores."""
@@ -121,63 +180,106 @@ class Cover:
 
     def holders(self, cell: int) -> tuple[int, ...]:
         """Tiles that hold a cell, ascending; the cell's owner among them."""
-        tile, part = divmod(int(cell), 9)
-        row, column = divmod(tile, self.columns)
-        i, j = divmod(part, 3)
-        rows, columns = {row, row + i - 1}, {column, column + j - 1}
-        return tuple(sorted(r * self.columns + c for r in rows for c in columns))
+        tile, zone = divmod(int(cell), ZONES**2)
+        return self._zones(tile)[1][zone]
 
     def cells_held(self, tile: int) -> tuple[int, ...]:
-        """Cells that a tile holds: its own nine (fewer on the rim) and its neighbours' shared with it, ascending."""
-        row, column = divmod(int(tile), self.columns)
-        held = set()
-        for r in range(max(row - 1, 0), min(row + 2, self.rows)):
-            for c in range(max(column - 1, 0), min(column + 2, self.columns)):
-                for cell in self.cells_owned(r * self.columns + c):
-                    if tile in self.holders(cell):
-                        held.add(cell)
+        """Cells that a tile holds: its own and its neighbours' shared with it, ascending."""
+        tile = int(tile)
+        held = [c for t in (tile, *self.neighbours(tile)) for c in self.cells_owned(t) if tile in self.holders(c)]
         return tuple(sorted(held))
 
     def cells_owned(self, tile: int) -> tuple[int, ...]:
-        """Cells of a tile's core that can hold a point: those whose neighbours exist, and whose overlap is not empty."""
-        row, column = divmod(int(tile), self.columns)
-        cells = []
-        for part in range(9):
-            i, j = divmod(part, 3)
-            inside = 0 <= row + i - 1 < self.rows and 0 <= column + j - 1 < self.columns
-            if inside and (part == 4 or self.overlap > 0.0):
-                cells.append(9 * int(tile) + part)
-        return tuple(cells)
+        """Cells of a tile's core, ascending."""
+        return tuple(ZONES**2 * int(tile) + zone for zone in sorted(set(self._zones(int(tile))[0])))
+
+    def neighbours(self, tile: int) -> tuple[int, ...]:
+        """Tiles that share a cell with a tile, ascending."""
+        tile = int(tile)
+        return tuple(sorted({t for cell in self.cells_owned(tile) for t in self.holders(cell)} - {tile}))
 
     @staticmethod
     def owner(cell: int) -> int:
         """The tile whose core holds a cell."""
-        return int(cell) // 9
+        return int(cell) // ZONES**2
+
+    def _address(self, tile: int) -> tuple[int, int, int]:
+        """Level (0: never split), row and column of a core on the grid of its size."""
+        if tile < self._base:
+            return (0, *divmod(tile, self.columns))
+        parent, quarter = divmod(tile - self._base, 4)
+        level, row, column = self._address(parent)
+        return level + 1, 2 * row + quarter // 2, 2 * column + quarter % 2
+
+    def side(self, tile: int) -> float:
+        """Side of a tile's core, metres."""
+        return float(self.core / 2 ** self._address(int(tile))[0])
+
+    def can_split(self, tile: int) -> bool:
+        """True when the quarters of a core are still as wide as the overlap."""
+        level = self._address(int(tile))[0]
+        return level < MAX_LEVEL and self.core / 2 ** (level + 1) >= self.overlap
+
+    def split(self, tile: int) -> Cover:
+        """The cover with a tile's core cut into four; larger neighbours are cut first, so that neighbours differ by one halving at most.
+
+        Raises
+        ------
+        InputError
+            When the tile is none of the cover, or its quarters would be narrower than the overlap.
+        """
+        tile, cover = int(tile), self
+        if tile in self.splits or not self.can_split(tile):
+            raise InputError(f"tile {self.tile_name(tile)} cannot be split: its quarters would be narrower than the overlap")
+        level = self._address(tile)[0]
+        while larger := [t for t in cover.neighbours(tile) if cover._address(t)[0] < level]:
+            cover = cover.split(larger[0])
+        return replace(cover, splits=tuple(sorted({*cover.splits, tile})))
+
+    def quarters(self, tile: int) -> tuple[int, int, int, int]:
+        """Tiles into which a tile was or would be split: south-west, south-east, north-west, north-east."""
+        first = self._base + 4 * int(tile)
+        return first, first + 1, first + 2, first + 3
 
     def tile_name(self, tile: int) -> str:
         """Name of a tile."""
+        if tile >= self._base:
+            parent, quarter = divmod(int(tile) - self._base, 4)
+            name = self.tile_name(parent)
+            return f"{name}{quarter}" if "q" in name else f"{name}q{quarter}"
         row, column = divmod(int(tile), self.columns)
         return f"r{row:03d}c{column:03d}"
 
     def tile_number(self, name: str) -> int:
         """Tile of a name; raises `InputError` when there is none."""
         match = _TILE_NAME.fullmatch(name)
-        if match:
-            row, column = int(match[1]), int(match[2])
-            if row < self.rows and column < self.columns:
-                return row * self.columns + column
+        if match and int(match[1]) < self.rows and int(match[2]) < self.columns:
+            tile, quarters = int(match[1]) * self.columns + int(match[2]), match[3] or ""
+            for quarter in quarters:
+                if tile not in self.splits:
+                    break
+                tile = self.quarters(tile)[int(quarter)]
+            if tile in self.splits:
+                parts = ", ".join(self.tile_name(t) for t in self.quarters(tile))
+                raise InputError(f"tile is {name!r}, which was split; expected one of its parts {parts}")
+            if self.tile_name(tile) == name:
+                return tile
         raise InputError(
-            f"tile is {name!r}; expected a name from r000c000 to {self.tile_name(self.rows * self.columns - 1)}"
-        )  # fmt: skip
+            f"tile is {name!r}; expected a name from r000c000 to r{self.rows - 1:03d}c{self.columns - 1:03d}, or of a part of a split one"
+        )
 
     def cell_name(self, cell: int) -> str:
-        """Name of a cell."""
-        return f"{self.tile_name(int(cell) // 9)}-{PARTS[int(cell) % 9]}"
+        """Name of a cell: the tiles that hold it, its owner first."""
+        owner = self.owner(cell)
+        return "+".join(self.tile_name(t) for t in (owner, *(t for t in self.holders(cell) if t != owner)))
 
     def cell_number(self, name: str) -> int:
-        """Cell of a name."""
-        tile, part = name.split("-")
-        return 9 * self.tile_number(tile) + PARTS.index(part)
+        """Cell of a name; raises `InputError` when there is none."""
+        owner = self.tile_number(name.split("+")[0])
+        for cell in self.cells_owned(owner):
+            if self.cell_name(cell) == name:
+                return cell
+        raise InputError(f"cell is {name!r}; expected one of {', '.join(map(self.cell_name, self.cells_owned(owner)))}")
 
     def depth(self, tile: int, longitude: Array, latitude: Array) -> Array:
         """Distance (n,) in metres from positions to the tile's outline, positive inside; rim sides are infinitely far."""
@@ -186,11 +288,13 @@ class Cover:
         return np.asarray(np.minimum.reduce([x - west, east - x, y - south, north - y]))
 
     def _bounds(self, tile: int, widen: float, *, open_rim: bool = False) -> tuple[float, float, float, float]:
-        row, column = divmod(int(tile), self.columns)
-        west, south = self.origin[0] + column * self.core, self.origin[1] + row * self.core
-        bounds = [west - widen, south - widen, west + self.core + widen, south + self.core + widen]
+        level, row, column = self._address(int(tile))
+        side = self.core / 2**level
+        west, south = self.origin[0] + column * side, self.origin[1] + row * side
+        bounds = [west - widen, south - widen, west + side + widen, south + side + widen]
         if open_rim:
-            for k, rim in enumerate((column == 0, row == 0, column == self.columns - 1, row == self.rows - 1)):
+            last_row, last_column = self.rows * 2**level - 1, self.columns * 2**level - 1
+            for k, rim in enumerate((column == 0, row == 0, column == last_column, row == last_row)):
                 if rim:
                     bounds[k] = -np.inf if k < 2 else np.inf
         return bounds[0], bounds[1], bounds[2], bounds[3]
@@ -208,8 +312,21 @@ class Cover:
         return _ring(*self._bounds(tile, 0.5 * self.overlap))
 
     def tiles(self) -> Iterator[int]:
-        """All tiles."""
-        return iter(range(self.rows * self.columns))
+        """All tiles, those of one core together."""
+
+        def leaves(tile: int) -> Iterator[int]:
+            if tile not in self.splits:
+                yield tile
+            else:
+                for quarter in self.quarters(tile):
+                    yield from leaves(quarter)
+
+        return (leaf for tile in range(self._base) for leaf in leaves(tile))
+
+    @property
+    def tile_count(self) -> int:
+        """Number of tiles."""
+        return self._base + 3 * len(self.splits)
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values that describe the cover."""
@@ -223,6 +340,7 @@ class Cover:
             "overlap": self.overlap,
             "semimajor_axis": self.ellipsoid.semimajor_axis,
             "flattening": self.ellipsoid.flattening,
+            "splits": list(self.splits),
         }
 
     @classmethod
@@ -231,7 +349,7 @@ class Cover:
         return cls(
             (values["centre"][0], values["centre"][1]), (values["origin"][0], values["origin"][1]),
             values["rows"], values["columns"], values["core"], values["overlap"],
-            Ellipsoid(values["semimajor_axis"], values["flattening"]),
+            Ellipsoid(values["semimajor_axis"], values["flattening"]), tuple(values["splits"]),
         )  # fmt: skip
 
 

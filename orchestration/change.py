@@ -1,0 +1,272 @@
+"""One change of a network: points are taken out of their cells and put back with other rays, tiles follow, and one commit ends it.
+
+Fusing blocks and withdrawing them differ only in the rays that come or go. The coordinator decides and commits; workers compute and
+write to forks of its session (docs/architecture.md). A crash anywhere before the commit leaves the last version as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import icechunk
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from orchestration.executors import Executor
+from orchestration.progress import Reporter
+from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, report_of, update_tile
+from submin.network.network_image import NetworkImage, image_set
+from submin.network.registration import LooseRays, Registration, register, taken_out, together
+from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
+from submin.storage.catalogue_schema import ImageRecord
+from submin.storage.ledger import Entry, append_entries
+from submin.storage.network_store import Snapshot, commit
+from submin.storage.schema import image_columns
+from submin.tiling.cover import Cover
+
+Ids = NDArray[np.str_]
+Index = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class TakenOut:
+    """Points that leave their cells, to be put back with the rays that they then have.
+
+    Attributes
+    ----------
+    rays : all their rays
+    departures : ids of the points by cell
+    dissolved : names of cells that vanish with all their points, because the tiles that hold them were split
+    """
+
+    rays: LooseRays
+    departures: dict[int, Ids]
+    dissolved: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Move:
+    """Where every touched point goes.
+
+    Attributes
+    ----------
+    cover : tiles of the new version
+    out : points taken out; registration : where they and the new ones go
+    images : images that are new with this change, in the order of their rows
+    """
+
+    cover: Cover
+    out: TakenOut
+    registration: Registration
+    images: tuple[NetworkImage, ...]
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What the tiles made of a move.
+
+    Attributes
+    ----------
+    reports : of the judged tiles
+    flags : pairs of tile and image row: the tile finds the image's camera bad
+    gone : cells and tiles to be deleted, because nothing is left of them
+    used, rejected : rays (m,) by image row, in the cells that were judged
+    """
+
+    reports: tuple[TileReport, ...]
+    flags: frozenset[tuple[int, int]]
+    gone: tuple[str, ...]
+    used: NDArray[np.int64]
+    rejected: NDArray[np.int64]
+
+    @property
+    def flagged(self) -> tuple[FlaggedImage, ...]:
+        """Images whose camera a judged tile finds bad."""
+        return tuple(image for report in self.reports for image in report.flagged)
+
+
+def take_points(base: Snapshot, ids: Ids) -> TakenOut:
+    """Take those of some points that the network has out of their cells."""
+    known = base.candidate_cells(ids)
+    rays, departures = [], {}
+    for number in np.unique(known[known >= 0]).tolist():
+        cell = base.cell(number, with_sums=False)
+        chosen = np.isin(cell.point_ids, ids[known == number])
+        if chosen.any():
+            rays.append(taken_out(cell, chosen))
+            departures[number] = cell.point_ids[chosen]
+    return TakenOut(together(rays), departures)
+
+
+def take_points_seen(base: Snapshot, images: Index) -> TakenOut:
+    """Take all points that some images (rows) see out of their cells, and leave the rays of these images away."""
+    seeing = [tile for tile in base.tile_numbers() if np.isin(images, base.tile_images(tile)).any()]
+    rays, departures = [], {}
+    for number in sorted({cell for tile in seeing for cell in base.cover.cells_owned(tile)} & set(base.cell_numbers())):
+        cell = base.cell(number, with_sums=False)
+        seen = np.zeros(len(cell), dtype=np.bool_)
+        seen[cell.rays.point[np.isin(cell.images[cell.rays.image], images)]] = True
+        if seen.any():
+            rays.append(taken_out(cell, seen))
+            departures[number] = cell.point_ids[seen]
+    loose = together(rays)
+    return TakenOut(loose.take(~np.isin(loose.image, images)), departures)
+
+
+def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequence[NetworkImage]) -> Move:
+    """Register the points taken out with their remaining and arriving rays; split the tiles that would then hold too many images."""
+    cover = base.cover
+    while True:
+        rays = together([arriving, out.rays])
+        first = base.image_count()
+        old = np.unique(rays.image[rays.image < first]).astype(np.int32)
+        rows = np.concatenate([old, np.arange(first, first + len(new_images), dtype=np.int32)])
+        images = image_set([*base.images(old), *new_images], base.metadata.ellipsoid, base.metadata.parameters)
+        registration = register(rays, images, rows, cover)
+        full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(base, cover, tile, out, registration)]
+        if not full:
+            return Move(cover, out, registration, tuple(new_images))
+        for tile in full:
+            if tile not in cover.splits:  # not yet, as the larger neighbour of another one
+                cover = cover.split(tile)
+        out = _dissolve(base, cover, out)
+
+
+def _touched_tiles(cover: Cover, out: TakenOut, registration: Registration) -> list[int]:
+    return sorted({tile for cell in {*registration.arrivals, *out.departures} for tile in cover.holders(cell)})
+
+
+def _overfull(base: Snapshot, cover: Cover, tile: int, out: TakenOut, registration: Registration) -> bool:
+    """True when a tile would hold more image parameters than it may, and can be split."""
+    if not cover.can_split(tile):
+        return False
+    limit = base.metadata.max_parameters // base.metadata.parameters
+    arriving = {c: registration.arrivals[c].image for c in cover.cells_held(tile) if c in registration.arrivals}
+    seen = [np.empty(0, dtype=np.int32), *arriving.values()]
+    if tile in base.tile_numbers():
+        at_most = len(np.unique(np.concatenate([*seen, base.tile_images(tile)])))
+        if at_most <= limit:
+            return False
+    stored = {base.cover.cell_name(c): c for c in base.cell_numbers()}
+    for number in cover.cells_held(tile):
+        name = cover.cell_name(number)
+        if name in stored and name not in out.dissolved:
+            cell = base.cell(stored[name], with_sums=False)
+            gone = np.isin(cell.point_ids, out.departures.get(number, np.empty(0, dtype="U1")))
+            seen.append(cell.images[np.unique(cell.rays.image[~gone[cell.rays.point]])])
+    return len(np.unique(np.concatenate(seen))) > limit
+
+
+def _dissolve(base: Snapshot, cover: Cover, out: TakenOut) -> TakenOut:
+    """Take out all points of the cells that are none of a refined cover; they are named by tiles that are split now."""
+    split = {*cover.splits} - {*base.cover.splits}
+    rays, departures, dissolved = [], dict(out.departures), set(out.dissolved)
+    taken = np.unique(out.rays.point_ids)
+    for number in base.cell_numbers():
+        name = base.cover.cell_name(number)
+        if name not in dissolved and split.intersection(base.cover.holders(number)):
+            cell = base.cell(number, with_sums=False)
+            gone = np.isin(cell.point_ids, departures.pop(number, np.empty(0, dtype="U1"))) | np.isin(cell.point_ids, taken)
+            rays.append(taken_out(cell, ~gone))
+            dissolved.add(name)
+    return TakenOut(together([out.rays, *rays]), departures, tuple(sorted(dissolved)))
+
+
+def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Executor, reporter: Reporter) -> Settled:
+    """Update and factor every tile that a move touches, and write cells and tiles into the session."""
+    cover = replace(move.cover)  # without what it has worked out so far: it travels with every task
+    arrivals, departures = move.registration.arrivals, move.out.departures
+    tiles = _touched_tiles(cover, move.out, move.registration)
+    shared = executor.share(list(move.images))
+    arguments = []
+    for tile in tiles:
+        held = move.cover.cells_held(tile)
+        arguments.append((
+            session.fork(), tile, cover,  # a fork each: a task must see the last version, not what another task writes
+            {c: arrivals[c] for c in held if c in arrivals}, {c: departures[c] for c in held if c in departures}, shared,
+        ))  # fmt: skip
+    updates = executor.submit_all(update_tile, arguments, "update-tile", reporter.stage("summing tiles", len(tiles)))
+    by_tile = dict(zip(tiles, updates, strict=True))
+    quiet = reporter.stage("summing tiles", 0)
+    reports: list[TileReport] = executor.results(executor.submit_all(report_of, [(u,) for u in updates], "report-of", quiet))
+
+    before = base.flags()
+    split = {*move.cover.splits}
+    flags = {(tile, row) for tile, row in before if tile not in by_tile and tile not in split}
+    flags |= {(report.tile, image.row) for report in reports for image in report.flagged}
+    released = sorted({row for _, row in flags})
+    reconsidered = {*released} ^ {row for _, row in before}
+    changed = {cell for report in reports for cell in report.changed}
+    again = {tile for cell in changed for tile in move.cover.holders(cell)} | _tiles_that_see(base, reconsidered)
+    to_factor = []
+    for tile in sorted(again - split):
+        sources = sorted({Cover.owner(c) for c in move.cover.cells_held(tile)} & set(by_tile))
+        to_factor.append((session.fork(), tile, cover, [by_tile[t] for t in sources], shared, released))
+    handles = executor.submit_all(factor_tile, to_factor, "factor-tile", reporter.stage("factoring tiles", len(to_factor)))
+    factored = executor.results(handles)
+    if reports or factored:
+        session.merge(*(report.writes for report in reports), *(done.writes for done in factored))
+    gone = [f"cells/{move.cover.cell_name(c)}" for report in reports for c, cell in report.cells.items() if not len(cell.images)]
+    gone += [f"cells/{name}" for name in move.out.dissolved]
+    gone += [f"tiles/{move.cover.tile_name(t.tile)}" for t in factored if not t.images]
+    gone += [f"tiles/{base.cover.tile_name(t)}" for t in split if t not in base.cover.splits]
+    used, rejected = _ray_counts((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
+    return Settled(tuple(reports), frozenset(flags), tuple(gone), used, rejected)
+
+
+def finish(
+    session: icechunk.Session, base: Snapshot, move: Move, settled: Settled, records: Sequence[ImageRecord], entries: Sequence[Entry],
+    message: str, withdrawn: Sequence[int] = (),
+) -> int:  # fmt: skip
+    """Write what the coordinator keeps, and commit: the number of the new version.
+
+    Parameters
+    ----------
+    records : catalogue records of the move's new images; entries : new lines of the ledger; withdrawn : rows of images that leave
+
+    Raises
+    ------
+    ConflictError
+        When another coordinator has committed meanwhile; nothing of the change is in the network then.
+    """
+    root, version = zarr.open_group(session.store, mode="r+"), base.number + 1
+    for name in settled.gone:
+        if name in root:
+            del root[name]
+    append_table(group_of(root, "images"), image_columns(move.images, records))
+    set_rows(group_of(root, "images"), "withdrawn", np.array(withdrawn, dtype=np.int64), np.ones(len(withdrawn), dtype=np.uint8))
+    _write_flags(root, settled.flags, base.flags())
+    append_entries(group_of(root, "ledger"), entries)
+    ids, at = move.registration.directory
+    listed = (at >= 0) & (base.candidate_cells(ids) != at)
+    append_table(group_of(root, "directory"), {"hash": hash_ids(ids[listed]), "cell": at[listed]})
+    if move.cover.splits != base.cover.splits:
+        root.attrs.update(replace(base.metadata, cover=move.cover.to_mapping()).to_attributes())
+    root.attrs["version"] = version
+    commit(session, version, message)
+    return version
+
+
+def _tiles_that_see(base: Snapshot, rows: Collection[int]) -> set[int]:
+    """Tiles of the last version that hold any of these images: their a priori model has changed."""
+    old = np.array(sorted(row for row in rows if row < base.image_count()), dtype=np.int32)
+    return {tile for tile in base.tile_numbers() if np.isin(old, base.tile_images(tile)).any()} if len(old) else set()
+
+
+def _ray_counts(cells: Iterable[CellReport], images: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    used, rejected = np.zeros(images, dtype=np.int64), np.zeros(images, dtype=np.int64)
+    for cell in cells:
+        np.add.at(used, cell.images, cell.used)
+        np.add.at(rejected, cell.images, cell.rejected)
+    return used, rejected
+
+
+def _write_flags(root: zarr.Group, flags: Collection[tuple[int, int]], before: Collection[tuple[int, int]]) -> None:
+    """Write which tile finds which camera bad, and mark the images concerned; images that are new are in the table already."""
+    released = {row for _, row in flags}
+    reconsidered = np.array(sorted(released ^ {row for _, row in before}), dtype=np.int64)
+    set_rows(group_of(root, "images"), "released", reconsidered, np.isin(reconsidered, sorted(released)).astype(np.uint8))
+    tile_and_image = np.array(sorted(flags), dtype=np.int64).reshape(-1, 2)
+    replace_table(group_of(root, "flags"), {"tile": tile_and_image[:, 0], "image": tile_and_image[:, 1]})

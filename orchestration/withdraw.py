@@ -1,0 +1,95 @@
+"""Withdrawal: a block, an image or a control point leaves a network as if it had never been fused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orchestration.change import finish, place, settle, take_points_seen
+from orchestration.executors import Executor
+from orchestration.progress import Reporter, Silent
+from submin.errors import InputError
+from submin.network.registration import together
+from submin.storage.control_blocks import control_block_id
+from submin.storage.ledger import Entry, Ledger
+from submin.storage.network_store import Snapshot, begin_change
+
+
+@dataclass(frozen=True)
+class Withdrawn:
+    """What was withdrawn.
+
+    Attributes
+    ----------
+    version : of the network afterwards
+    what : block, image or control point, with its id; images, rays : that left with it
+    tiles : names of the tiles that were judged and factored again
+    """
+
+    version: str
+    what: str
+    images: int
+    rays: int
+    tiles: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"version": self.version, "withdrawn": self.what, "images": self.images, "rays": self.rays, "tiles": list(self.tiles)}
+
+
+def withdraw(
+    where: str, executor: Executor, *, block: str | None = None, image: str | None = None, control: str | None = None,
+    reporter: Reporter | None = None,
+) -> Withdrawn:  # fmt: skip
+    """Withdraw one block, image or control point, by its id. It can come again.
+
+    The last image of a block takes the block with it. A block of which an image was withdrawn stays in the ledger: the same block again
+    is skipped, and brings the image back only after the whole block was withdrawn.
+
+    Raises
+    ------
+    InputError
+        When the network does not have it, or not exactly one is named.
+    ConflictError
+        When another run has committed meanwhile; nothing has changed then.
+    """
+    named = [(kind, value) for kind, value in (("block", block), ("image", image), ("control point", control)) if value is not None]
+    if len(named) != 1:
+        raise InputError("give exactly one of --block, --image and --control")
+    kind, name = named[0]
+    session, base = begin_change(where)
+    ledger = Ledger.of(base)
+    table = base.image_columns(["image_id", "block_id", "withdrawn"])
+    here = table["withdrawn"] == 0
+    block_id = ledger.block_of_image.get(name, "") if kind == "image" else control_block_id(name) if kind == "control point" else name
+    of_block = np.flatnonzero(here & (table["block_id"] == block_id))
+    rows = of_block[table["image_id"][of_block] == name] if kind == "image" else of_block
+    if not len(rows):
+        raise InputError(f"{where}: {kind} {name!r} is not in the network; see 'submin info', or 'submin history' for what came and went")
+
+    reporter = reporter or Silent()
+    out = take_points_seen(base, rows.astype(np.int32))
+    move = place(base, out, together([]), [])
+    settled = settle(session, base, move, executor, reporter)
+    before = ledger.entries[block_id]
+    rays = before.rays if len(rows) == len(of_block) else _rays_of(base, rows)
+    left = replace(before, version=base.number + 1, images=before.images - len(rows), rays=before.rays - rays, rays_rejected=0)
+    if len(rows) == len(of_block):
+        entry = replace(left, status="withdrawn", reason=f"{kind} withdrawn")
+    else:
+        entry = replace(left, reason=f"without image {name}", rays_rejected=before.rays_rejected)
+    entries: list[Entry] = [entry]
+    finish(session, base, move, settled, [], entries, f"{kind} {name} withdrawn", withdrawn=rows.tolist())
+    tiles = tuple(move.cover.tile_name(report.tile) for report in settled.reports)
+    return Withdrawn(f"v{base.number + 1}", f"{kind} {name}", len(rows), rays, tiles)
+
+
+def _rays_of(base: Snapshot, rows: np.ndarray[Any, np.dtype[np.int64]]) -> int:
+    """Rays of some images."""
+    total = 0
+    for number in base.cell_numbers():
+        cell = base.cell(number, with_sums=False)
+        total += int(np.isin(cell.images[cell.rays.image], rows).sum())
+    return total

@@ -1,0 +1,116 @@
+"""The ledger: what came into a network, when, and what became of it. It makes sure that everything counts exactly once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+import zarr
+
+from submin.storage.arrays import append_table
+from submin.storage.catalogue_schema import Block, defects
+from submin.storage.control_blocks import control_point_of
+from submin.storage.network_store import Snapshot
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the ledger. The last line of a block that is not a rejection counts: a rejected newcomer leaves what is there.
+
+    Attributes
+    ----------
+    block_id : the block; ``control:ID`` for a control point
+    content : hash of what came, see `Block.content_hash`; empty for a rejected block
+    status : ``fused``, ``rejected`` or ``withdrawn``
+    reason : why it was rejected, or which images are withdrawn from it
+    version : that the line came with
+    images, rays, rays_rejected : what the network has of the block
+    """
+
+    block_id: str
+    content: str
+    status: str
+    reason: str
+    version: int
+    images: int = 0
+    rays: int = 0
+    rays_rejected: int = 0
+
+
+def append_entries(ledger: zarr.Group, entries: Sequence[Entry]) -> None:
+    """Append lines to the ledger's table."""
+    if entries:
+        columns = zip(*(astuple(entry) for entry in entries), strict=True)
+        append_table(ledger, {f.name: np.array(values) for f, values in zip(fields(Entry), columns, strict=True)})
+
+
+class Ledger:
+    """What a version of a network holds, and what a run has added to it since.
+
+    Attributes
+    ----------
+    entries : the line that counts of each block that is or was in the network
+    rejections : reason of each block whose last line is a rejection
+    block_of_image : block of every image that is not withdrawn
+    """
+
+    def __init__(self, lines: Iterable[Entry], block_of_image: dict[str, str]) -> None:
+        self.entries: dict[str, Entry] = {}
+        self.rejections: dict[str, str] = {}
+        self.block_of_image = block_of_image
+        for line in lines:
+            if line.status == "rejected":
+                self.rejections[line.block_id] = line.reason
+            else:
+                self.entries[line.block_id] = line
+                self.rejections.pop(line.block_id, None)
+        self._content = {e.block_id: e.content for e in self.entries.values() if e.status == "fused"}
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> Ledger:
+        """The ledger of a version."""
+        table = snapshot.ledger([f.name for f in fields(Entry)])
+        rows = zip(*(values.tolist() for values in table.values()), strict=True)
+        images = snapshot.image_columns(["image_id", "block_id", "withdrawn"])
+        here = images["withdrawn"] == 0
+        return cls(
+            [Entry(*row) for row in rows],
+            dict(zip(images["image_id"][here].tolist(), images["block_id"][here].tolist(), strict=True)),
+        )
+
+    def holds(self, block: Block) -> bool:
+        """True when the same block is in the network."""
+        return block.block_id in self._content and self._content[block.block_id] == block.content_hash()
+
+    def refusal(self, block: Block) -> str | None:
+        """Why a block that is not the same as before cannot come in, or None."""
+        control = control_point_of(block.block_id)
+        if block.block_id in self._content:
+            if control is not None:
+                return (
+                    f"control point {control} is already in the network with other values; withdraw it first ('submin withdraw --control')"
+                )
+            return f"block {block.block_id} is already in the network with other content; withdraw it first, or give the new one another id"
+        for image in block.images:
+            if image.image_id in self.block_of_image:
+                return f"image {image.image_id} already came in block {self.block_of_image[image.image_id]}; an image counts once"
+        return defects(block)
+
+    def enter(self, block: Block) -> None:
+        """A block is on its way in: nothing later in the run may bring it or its images again."""
+        self._content[block.block_id] = block.content_hash()
+        self.block_of_image.update((image.image_id, block.block_id) for image in block.images)
+
+    def said(self, refused: Iterable[tuple[str, str]]) -> bool:
+        """True when the last line of each of these blocks is a rejection for the same reason."""
+        return all(self.rejections.get(block_id) == reason for block_id, reason in refused)
+
+    def fused(self) -> tuple[Entry, ...]:
+        """Blocks of images that are in the network."""
+        return tuple(e for e in self.entries.values() if e.status == "fused" and control_point_of(e.block_id) is None)
+
+    def control_points(self) -> tuple[str, ...]:
+        """Ids of the control points that are in the network."""
+        found = (control_point_of(e.block_id) for e in self.entries.values() if e.status == "fused")
+        return tuple(sorted(point for point in found if point is not None))
