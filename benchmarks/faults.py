@@ -48,8 +48,8 @@ EVERYWHERE = (-180.0, -90.0, 180.0, 90.0)
 LONGEST = 120.0
 """Seconds after which a run counts as hanging."""
 KINDS = ("one worker", "all workers", "coordinator", "scheduler")
-Moment = Callable[["Command"], None]
-"""Waits until it is time to kill; it is given the running command."""
+Moment = Callable[["Command", Path], None]
+"""Waits until it is time to kill; it is given the running command and its network."""
 
 
 class Command:
@@ -364,7 +364,7 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
         first = stack.enter_context(scene.run(network, f"{name}-first", *where))
         wait_until(lambda: begun(network), first)
         began = time.monotonic()
-        moment(first)
+        moment(first, network)
         if first.process.poll() is not None:
             raise TooLate
         workers = first.workers()
@@ -415,6 +415,11 @@ def begun(network: Path) -> bool:
     return lock.exists() and lock.stat().st_size > 0
 
 
+def after_commit(number: int) -> Moment:
+    """The moment when a version is there."""
+    return lambda command, network: wait_until(lambda: Snapshot.open(str(network)).number >= number, command)
+
+
 def undisturbed_run(scene: Scene) -> tuple[Content, float]:
     """The network that every trial must leave, and the seconds of its run, with a reader as in the trials."""
     network = scene.network("undisturbed")
@@ -427,8 +432,9 @@ def undisturbed_run(scene: Scene) -> tuple[Content, float]:
     return Content.of(network), seconds
 
 
-def _after(seconds: float) -> Moment:
-    return lambda command: time.sleep(seconds)
+def after(seconds: float) -> Moment:
+    """So many seconds after the run has begun."""
+    return lambda command, network: time.sleep(seconds)
 
 
 def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None) -> list[dict[str, Any]]:
@@ -444,7 +450,7 @@ def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None
         while len(rows) < kills:
             kind, moment = KINDS[len(rows) % len(KINDS)], rng.uniform(0.0, seconds)
             try:
-                done = trial(scene, undisturbed, kind, _after(moment), f"kill-{len(rows) + 1}", rng)
+                done = trial(scene, undisturbed, kind, after(moment), f"kill-{len(rows) + 1}", rng)
             except TooLate:
                 shutil.rmtree(scene.folder / f"kill-{len(rows) + 1}")
                 continue
