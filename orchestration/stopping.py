@@ -5,11 +5,14 @@ Imports nothing that takes time: the command line must answer to Ctrl-C while it
 
 from __future__ import annotations
 
+import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+PATIENCE_SECONDS = 5.0
 SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 
 
@@ -28,12 +31,20 @@ class Stopped(BaseException):
 
 @contextmanager
 def signals_stop() -> Iterator[None]:
-    """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is; later ones leave it to clean up in peace."""
+    """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is.
+
+    Later ones leave it to clean up in peace, for so long as that may take; then they end the process as it is, which loses nothing
+    that is committed.
+    """
+    first: float | None = None
 
     def stop(number: int, frame: FrameType | None) -> None:
-        for each in SIGNALS:
-            signal.signal(each, signal.SIG_IGN)
-        raise Stopped(number)
+        nonlocal first
+        if first is None:
+            first = time.monotonic()
+            raise Stopped(number)
+        if time.monotonic() - first > PATIENCE_SECONDS:
+            os._exit(Stopped(number).exit_code)
 
     # a signal that is ignored already (a job in the background) stays ignored
     before = {each: signal.signal(each, stop) for each in SIGNALS if signal.getsignal(each) is not signal.SIG_IGN}

@@ -44,7 +44,7 @@ SEED = 20260601
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return make_scene(tmp_path_factory.mktemp("faults"), 120.0, 5, 2)
+    return make_scene(tmp_path_factory.mktemp("faults"), 80.0, 2, 2)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_a_killed_process_changes_nothing(scene: Scene, undisturbed: tuple[Conte
     """Killed when the first of three batches is committed. The trial checks the network, the messages, orphans and the reader."""
     done = trial(scene, undisturbed[0], kind, after_commit(1), kind.replace(" ", "-"), random.Random(SEED))
     assert done.faults == ()
-    assert done.version in ("v1", "v2")
+    assert done.version in ("v1", "v2")  # of three
     assert done.readings.answers > 5
     assert len(done.readings.versions) >= 2  # it did read while versions were written
 
@@ -136,11 +136,11 @@ def test_without_the_lock_the_commit_decides(
     class AnotherRun(Silent):
         def stage(self, name, total):  # type: ignore[no-untyped-def]
             if name == "factoring tiles" and Snapshot.open(network).number == 0:
-                assert run(catalogue, network, SerialExecutor()).fused == 12
+                assert run(catalogue, network, SerialExecutor()).fused == 6
             return super().stage(name, total)
 
     with pytest.raises(ConflictError, match="nothing of this batch was written"):
-        run(catalogue, network, SerialExecutor(), batch_blocks=5, reporter=AnotherRun())
+        run(catalogue, network, SerialExecutor(), batch_blocks=2, reporter=AnotherRun())
     assert Snapshot.open(network).version == "v1"
     assert undisturbed[0].faults(Content.of(Path(network))) == []
     assert run(catalogue, network, SerialExecutor()).fused == 0
