@@ -11,11 +11,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import main_job
+from benchmarks import faults, main_job
 from benchmarks.machine import machine
 
-BENCHMARKS: dict[str, tuple[str, Callable[[float, int], list[dict[str, Any]]]]] = {
+BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "main-job": ("the rate of every station from rays to a committed network", main_job.measure),
+    "faults": ("a run whose processes are killed leaves the network of an undisturbed one", faults.measure),
 }
 
 
@@ -23,6 +24,8 @@ def command(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run; without one they are listed.")] = None,
     scale: Annotated[float, typer.Option(help="Part of the full size.")] = 1.0,
     workers: Annotated[int, typer.Option(help="Worker processes.")] = 2,
+    kills: Annotated[int | None, typer.Option(min=1, help="faults: number of kills.")] = None,
+    seed: Annotated[int | None, typer.Option(help="faults: seed of the moments; default: drawn, and said.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Run a benchmark and print it beside the machine that it ran on."""
@@ -33,7 +36,10 @@ def command(
         return
     if name not in BENCHMARKS:
         raise typer.BadParameter(f"{name!r}; expected one of {', '.join(BENCHMARKS)}")
-    rows = BENCHMARKS[name][1](scale, workers)
+    more = {option: value for option, value in (("kills", kills), ("seed", seed)) if value is not None}
+    if more and name != "faults":
+        raise typer.BadParameter(f"--{next(iter(more))} is an option of faults")
+    rows = BENCHMARKS[name][1](scale, workers, **more)
     host = machine()
     if as_json:
         sys.stdout.write(json.dumps({"benchmark": name, "scale": scale, "machine": host, "rows": rows}) + "\n")

@@ -54,22 +54,24 @@ class BatchResult:
     unsettled: tuple[int, ...]
 
 
-def fuse_batch(where: str, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter) -> BatchResult:
-    """Fuse blocks that the ledger has let through; ``rejected`` blocks of the batch are entered in the ledger in the same commit.
+def fuse_batch(
+    where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter
+) -> BatchResult:
+    """Fuse blocks that the ledger of a version has let through; ``rejected`` ones are entered in the ledger in the same commit.
 
     Raises
     ------
     ConflictError
         When another run has committed meanwhile; nothing of the batch is in the network then.
     """
-    session, base = begin_change(where)
+    session, base = begin_change(where, version)
     refused = list(rejected)
     blocks = _stage_one(blocks, base, executor, reporter, refused)
     blocks, move = _register(blocks, base, refused)
     if not blocks and Ledger.of(base).said((r.block_id, r.reason) for r in refused):
         return BatchResult(base.number, (), tuple(refused), (), (), ())  # the same command again writes nothing
     settled = settle(session, base, move, executor, reporter)
-    version = base.number + 1
+    version += 1
     lost = settled.rejected[base.image_count() :]
     of_block = np.repeat(np.arange(len(blocks)), [len(block.images) for block in blocks])
     rejected_rays = np.bincount(of_block, weights=lost, minlength=len(blocks)).astype(np.int64).tolist()

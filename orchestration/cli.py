@@ -1,6 +1,7 @@
 """The command line: ``submin COMMAND``.
 
-Exit codes: 0 done; 1 done in part (some blocks rejected; each is named with its reason); 2 wrong usage or bad input, nothing written.
+Exit codes: 0 done; 1 done in part (some blocks rejected; each is named with its reason); 2 wrong usage or bad input, nothing written,
+or the cluster was lost (what was committed stays); 130 and 143 stopped by Ctrl-C and by SIGTERM (what was committed stays).
 """
 
 from __future__ import annotations
@@ -9,13 +10,13 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from submin.errors import InputError, SubminError
+from orchestration.stopping import Stopped, signals_stop
 
 if TYPE_CHECKING:
     from submin.storage.network_store import Version
@@ -57,6 +58,8 @@ def show(values: dict[str, Any], as_json: bool, text: str) -> None:
 def check_range(option: str, value: int, least: int, most: int | None = None) -> None:
     """Refuse the value of an option that is out of its range."""
     if value < least or (most is not None and value > most):
+        from submin.errors import InputError
+
         raise InputError(f"{option} is {value}; expected {least} {'or more' if most is None else f'to {most}'}")
 
 
@@ -101,6 +104,7 @@ def simulate_region_command(
 
     Example: submin simulate region --out catalogue --scale 0.25
     """
+    from submin.errors import InputError
     from submin.simulation.region import RegionDesign, simulate_region
     from submin.storage.simulated import write_region
 
@@ -142,6 +146,7 @@ def create(
     """
     from orchestration.create import create as make
     from orchestration.create import fit_catalogue, read_area
+    from submin.errors import InputError
     from submin.storage.catalogue import Catalogue
     from submin.storage.catalogue_schema import CatalogueMetadata
     from submin.storage.network import box_area
@@ -179,12 +184,13 @@ def run(
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
     from orchestration.run import run as fuse
+    from orchestration.stopping import resumable
     from submin.storage.catalogue import Catalogue
 
     check_range("--workers", workers, 0, MOST_WORKERS)
     check_range("--batch-blocks", batch_blocks, 1)
     opened = Catalogue.open(catalogue)
-    with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
     lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
     if result.rays_used:
@@ -217,10 +223,11 @@ def control_add(
     from orchestration.control import add_control
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
+    from orchestration.stopping import resumable
     from submin.storage.point_table import read_point_table
 
     table = read_point_table(points, "definite")
-    with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         added = add_control(table, str(points), network, executor, reporter)
     lines = [
         f"{network} {added.version}: {added.fused} control points added, {added.skipped} already there, {len(added.rejected)} rejected"
@@ -247,9 +254,10 @@ def withdraw(
     """
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
+    from orchestration.stopping import resumable
     from orchestration.withdraw import withdraw as take
 
-    with progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         done = take(network, executor, block=block, image=image, control=control, reporter=reporter)
     show(done.to_json(), as_json, f"{network} {done.version}: {done.what} withdrawn with {done.rays:,} rays; "
          f"{len(done.tiles)} tiles judged again")  # fmt: skip
@@ -467,16 +475,25 @@ def _tags(version: Version) -> str:
 
 
 def main() -> None:
-    """Run the command line; an error is one line on standard error and exit code 2."""
+    """Run the command line; an error, or a signal to stop, is one line on standard error."""
     try:
-        sys.exit(app(prog_name="submin", standalone_mode=False))
-    except (SubminError, OSError, USAGE_ERROR) as error:
-        message = " ".join(_message(error).split())
-        if message:  # a group of commands without one has printed its help
-            Console(stderr=True, highlight=False, markup=False).print(f"submin: {message}", soft_wrap=True)
-        if "--json" in sys.argv:
-            sys.stdout.write(json.dumps({"error": message}) + "\n")
-        sys.exit(2)
+        with signals_stop():
+            from submin.errors import SubminError  # the first import that takes time
+
+            try:
+                sys.exit(app(prog_name="submin", standalone_mode=False))
+            except (SubminError, OSError, USAGE_ERROR) as error:
+                _fail(" ".join(_message(error).split()), 2)
+    except Stopped as stopped:
+        _fail(str(stopped), stopped.exit_code)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    if message:  # a group of commands without one has printed its help
+        Console(stderr=True, highlight=False, markup=False).print(f"submin: {message}", soft_wrap=True)
+    if "--json" in sys.argv:
+        sys.stdout.write(json.dumps({"error": message}) + "\n")
+    sys.exit(code)
 
 
 def _message(error: Exception) -> str:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import resource
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from multiprocessing import resource_tracker
+from typing import Any, Protocol, TypeVar
 
 from submin.adjustment.warm_up import compile_kernels
-from submin.errors import InputError
+from submin.errors import ClusterError, InputError
 
+SHARED_VALUES_GO_WITH_TASKS = {"distributed.admin.large-graph-warning-threshold": "1GB"}
+"""Dask would warn at 10 MB and ask to scatter; `DaskExecutor.share` says why not."""
 Advance = Callable[[], None]
+T = TypeVar("T")
 
 
 class Executor(Protocol):
@@ -68,15 +74,19 @@ class SerialExecutor:
 
 
 class DaskExecutor:
-    """Runs tasks on a Dask cluster, at most three a worker in flight, so that memory does not grow with the number of tasks."""
+    """Runs tasks on a Dask cluster, at most three a worker in flight, so that memory does not grow with the number of tasks.
+
+    Every handle is the result of a task: what a lost worker held is computed again.
+    """
 
     def __init__(self, client: Any) -> None:
         self.client = client
         self.workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+        self._address = client.scheduler.address
 
     def share(self, value: Any) -> Any:
-        """See `Executor.share`."""
-        return self.client.scatter([value], broadcast=True)[0]
+        """See `Executor.share`. A task, since scattered values are gone for good with the workers that hold them."""
+        return self.submit_all(_same, [(value,)], "share", lambda: None)[0]
 
     def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
         """See `Executor.submit_all`."""
@@ -90,26 +100,66 @@ class DaskExecutor:
             if k is None:
                 return None
             handles[k] = self.client.submit(function, *arguments[k], pure=False, key=f"{name}-{os.urandom(6).hex()}")
+            # a loss from here on cancels the handle; one before it is seen here, and nowhere else
+            self._check_scheduler()
             return handles[k]
 
-        first = [f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None]
-        running: Any = as_completed(first)
-        for future in running:
-            if future.status != "finished":
-                future.result()  # raises the task's error here
-            advance()
-            following = submit_next()
-            if following is not None:
-                running.add(following)
+        with self._losses_said():
+            first = [f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None]
+            running: Any = as_completed(first)
+            for future in running:
+                if future.status != "finished":
+                    future.result()  # raises the task's error here
+                advance()
+                following = submit_next()
+                if following is not None:
+                    running.add(following)
         return handles
 
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""
-        return list(self.client.gather(list(handles)))
+        with self._losses_said():
+            return list(self.client.gather(list(handles)))
 
     def peak_memory_mb(self) -> float:
         """See `Executor.peak_memory_mb`."""
-        return own_peak_memory_mb() + float(sum(self.client.run(own_peak_memory_mb).values()))
+        with self._losses_said():
+            self._check_scheduler()
+            return own_peak_memory_mb() + float(sum(self.client.run(own_peak_memory_mb, on_error="ignore").values()))
+
+    @contextmanager
+    def _losses_said(self) -> Iterator[None]:
+        """What Dask raises when processes are lost, as one error that says it. Errors of tasks pass."""
+        from concurrent.futures import CancelledError
+
+        from distributed import KilledWorker
+        from distributed.client import ClosedClientError
+        from distributed.comm.core import CommClosedError
+
+        try:
+            yield
+        except KilledWorker as error:
+            task = str(error.task).rpartition("-")[0]
+            raise ClusterError(
+                f"{error.allowed_failures + 1} workers that ran the same task ({task}) were killed, as happens where memory is short",
+                "give the same command again, with fewer workers or fewer --batch-blocks",
+            ) from None
+        except (CancelledError, CommClosedError, ClosedClientError):
+            raise self._lost() from None
+        except OSError:
+            self._check_scheduler()  # a connection that could not be made
+            raise
+
+    def _check_scheduler(self) -> None:
+        if self.client.status != "running":
+            raise self._lost()
+
+    def _lost(self) -> ClusterError:
+        return ClusterError(f"the Dask scheduler at {self._address} was lost", "start a cluster and give the same command again")
+
+
+def _same(value: T) -> T:
+    return value
 
 
 @contextmanager
@@ -128,19 +178,37 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
     from distributed import Client, LocalCluster
 
     if scheduler is not None:
+        # what Dask logs of a lost scheduler, with tracebacks, is raised too
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             client = Client(scheduler, timeout="10s")
         except (OSError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {scheduler!r} ({error}); start one with 'dask scheduler'") from None
-        with client:
+        with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), client:
             yield DaskExecutor(client)
         return
     compile_kernels()
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    with (
-        # set before the workers load numpy
-        dask.config.set({"distributed.nanny.pre-spawn-environ": threads, "distributed.worker.memory.terminate": False}),
-        LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40) as cluster,
-        Client(cluster) as client,
-    ):
-        yield DaskExecutor(client)
+    # set before the workers load numpy
+    settings = {"distributed.nanny.pre-spawn-environ": threads, "distributed.worker.memory.terminate": False}
+    with dask.config.set(settings | SHARED_VALUES_GO_WITH_TASKS):
+        with _children_deaf_to_ctrl_c():
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL
+            )  # fmt: skip
+        with cluster, Client(cluster) as client:
+            yield DaskExecutor(client)
+
+
+@contextmanager
+def _children_deaf_to_ctrl_c() -> Iterator[None]:
+    """Processes that are started in the body, or later by threads that are, do not get the terminal's Ctrl-C.
+
+    It goes to every process of the group; ending the workers is the coordinator's part. Here it comes when the body is left.
+    """
+    resource_tracker.ensure_running()  # where it starts, it would unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -19,7 +19,8 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, control_point_of
 from submin.storage.ledger import Ledger
-from submin.storage.network_store import Snapshot, clear_write_errors
+from submin.storage.network_store import Snapshot
+from submin.storage.writer_lock import writing
 
 DEFAULT_BATCH_BLOCKS = 500
 
@@ -96,9 +97,10 @@ def run(
     ------
     InputError
         When the catalogue breaks its contract, or its frame is not the network's: found before anything is written.
+    BusyError, ConflictError
+        When another process is writing to the network.
     """
-    started = time.monotonic()
-    reporter = reporter or Silent()
+    started, reporter = time.monotonic(), reporter or Silent()
     snapshot = Snapshot.open(place)
     check_frames(catalogue, snapshot)
     summary = catalogue.validate()
@@ -112,15 +114,26 @@ def run(
 
 
 def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> Tally:
-    """Fuse those of some blocks that the network does not have yet, so many to a commit."""
+    """Fuse those of some blocks that the network does not have yet, so many to a commit.
+
+    Raises
+    ------
+    BusyError
+        When another process is writing to the network.
+    ConflictError
+        When one has written to it since the ledger was read, where there is no lock to keep it out.
+    """
     tally = Tally()
-    new = _new_blocks(blocks, Ledger.of(Snapshot.open(place)), tally, reporter)
-    while batch := list(islice(new, max(batch_blocks, 1))):
-        good = [block for block, reason in batch if reason is None]
-        refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-        with clear_write_errors(place):
-            tally.add(fuse_batch(place, good, refused, executor, reporter))
-        reporter.fused(len(batch))
+    with writing(place):
+        known = Snapshot.open(place)
+        version, new = known.number, _new_blocks(blocks, Ledger.of(known), tally, reporter)
+        while batch := list(islice(new, max(batch_blocks, 1))):
+            good = [block for block, reason in batch if reason is None]
+            refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
+            done = fuse_batch(place, version, good, refused, executor, reporter)
+            version = done.version
+            tally.add(done)
+            reporter.fused(len(batch))
     return tally
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orchestration.change import finish, place, settle, take_points_seen
 from orchestration.executors import Executor
@@ -15,6 +16,7 @@ from submin.network.registration import together
 from submin.storage.control_blocks import control_block_id
 from submin.storage.ledger import Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
+from submin.storage.writer_lock import writing
 
 
 @dataclass(frozen=True)
@@ -52,41 +54,61 @@ def withdraw(
     ------
     InputError
         When the network does not have it, or not exactly one is named.
-    ConflictError
-        When another run has committed meanwhile; nothing has changed then.
+    BusyError, ConflictError
+        When another process is writing to the network; nothing has changed then.
     """
     named = [(kind, value) for kind, value in (("block", block), ("image", image), ("control point", control)) if value is not None]
     if len(named) != 1:
         raise InputError("give exactly one of --block, --image and --control")
     kind, name = named[0]
-    session, base = begin_change(where)
+    _leaving(Snapshot.open(where), kind, name)  # what is not there is refused before anything is touched
+    with writing(where):
+        current = Snapshot.open(where)
+        leaving = _leaving(current, kind, name)  # again, now that nobody else writes
+        return _withdraw(where, current.number, leaving, executor, reporter or Silent())
+
+
+@dataclass(frozen=True)
+class _Leaving:
+    """What leaves: its kind and name, its block, the rows of its images, and whether they are all that the block has left."""
+
+    kind: str
+    name: str
+    before: Entry
+    rows: NDArray[np.int64]
+    whole_block: bool
+
+
+def _leaving(base: Snapshot, kind: str, name: str) -> _Leaving:
     ledger = Ledger.of(base)
     table = base.image_columns(["image_id", "block_id", "withdrawn"])
-    here = table["withdrawn"] == 0
     block_id = ledger.block_of_image.get(name, "") if kind == "image" else control_block_id(name) if kind == "control point" else name
-    of_block = np.flatnonzero(here & (table["block_id"] == block_id))
+    of_block = np.flatnonzero((table["withdrawn"] == 0) & (table["block_id"] == block_id))
     rows = of_block[table["image_id"][of_block] == name] if kind == "image" else of_block
     if not len(rows):
-        raise InputError(f"{where}: {kind} {name!r} is not in the network; see 'submin info', or 'submin history' for what came and went")
+        raise InputError(
+            f"{base.place}: {kind} {name!r} is not in the network; see 'submin info', or 'submin history' for what came and went"
+        )
+    return _Leaving(kind, name, ledger.entries[block_id], rows, len(rows) == len(of_block))
 
-    reporter = reporter or Silent()
-    out = take_points_seen(base, rows.astype(np.int32))
-    move = place(base, out, together([]), [])
+
+def _withdraw(where: str, version: int, leaving: _Leaving, executor: Executor, reporter: Reporter) -> Withdrawn:
+    session, base = begin_change(where, version)
+    rows, before, what = leaving.rows, leaving.before, f"{leaving.kind} {leaving.name}"
+    move = place(base, take_points_seen(base, rows.astype(np.int32)), together([]), [])
     settled = settle(session, base, move, executor, reporter)
-    before = ledger.entries[block_id]
-    rays = before.rays if len(rows) == len(of_block) else _rays_of(base, rows)
-    left = replace(before, version=base.number + 1, images=before.images - len(rows), rays=before.rays - rays, rays_rejected=0)
-    if len(rows) == len(of_block):
-        entry = replace(left, status="withdrawn", reason=f"{kind} withdrawn")
+    rays = before.rays if leaving.whole_block else _rays_of(base, rows)
+    left = replace(before, version=version + 1, images=before.images - len(rows), rays=before.rays - rays)
+    if leaving.whole_block:
+        entry = replace(left, status="withdrawn", reason=f"{leaving.kind} withdrawn", rays_rejected=0)
     else:
-        entry = replace(left, reason=f"without image {name}", rays_rejected=before.rays_rejected)
-    entries: list[Entry] = [entry]
-    finish(session, base, move, settled, [], entries, f"{kind} {name} withdrawn", withdrawn=rows.tolist())
+        entry = replace(left, reason=f"without image {leaving.name}")
+    finish(session, base, move, settled, [], [entry], f"{what} withdrawn", withdrawn=rows.tolist())
     tiles = tuple(move.cover.tile_name(report.tile) for report in settled.reports)
-    return Withdrawn(f"v{base.number + 1}", f"{kind} {name}", len(rows), rays, tiles)
+    return Withdrawn(f"v{version + 1}", what, len(rows), rays, tiles)
 
 
-def _rays_of(base: Snapshot, rows: np.ndarray[Any, np.dtype[np.int64]]) -> int:
+def _rays_of(base: Snapshot, rows: NDArray[np.int64]) -> int:
     """Rays of some images."""
     total = 0
     for number in base.cell_numbers():

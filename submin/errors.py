@@ -21,6 +21,18 @@ class ConflictError(StoreError):
     """Another coordinator committed to the network while this one was at work."""
 
 
+class BusyError(StoreError):
+    """Another process is writing to the network."""
+
+
+class ClusterError(SubminError):
+    """The processes that compute were lost: the scheduler, or the same task's workers again and again."""
+
+    def __init__(self, problem: str, remedy: str) -> None:
+        super().__init__(f"{problem}; {remedy}")
+        self.problem, self.remedy = problem, remedy
+
+
 class NumericalError(SubminError):
     """A computation without a trustworthy result (a matrix that is not positive definite, no convergence)."""
 

@@ -301,12 +301,24 @@ def commit(session: icechunk.Session, version: int, message: str) -> None:
         ) from None
 
 
-def begin_change(place: str) -> tuple[icechunk.Session, Snapshot]:
-    """A session in which to write the next version, and the version that it starts from, which what is written does not change."""
+def begin_change(place: str, version: int) -> tuple[icechunk.Session, Snapshot]:
+    """A session in which to write what follows a version, and that version, which what is written does not change.
+
+    Raises
+    ------
+    ConflictError
+        When it is not the newest version any more: what was decided by its ledger may not hold.
+    """
     repository = _open_repository(place)
     session = repository.writable_session(BRANCH)
     base = repository.readonly_session(snapshot_id=session.snapshot_id)
-    return session, Snapshot(zarr.open_group(base.store, mode="r"), place)
+    snapshot = Snapshot(zarr.open_group(base.store, mode="r"), place)
+    if snapshot.number != version:
+        raise ConflictError(
+            f"another run committed to this network meanwhile (v{snapshot.number} after v{version}); nothing of this change was written: "
+            "give the same command again"
+        )
+    return session, snapshot
 
 
 @contextmanager
@@ -321,7 +333,12 @@ def clear_write_errors(place: str) -> Iterator[None]:
     try:
         yield
     except icechunk.IcechunkError as error:
-        raise StoreError(
-            f"{place}: cannot be written ({_reason(error)}); nothing of this change is in the network: "
-            "make room or mend the permissions, and give the same command again"
-        ) from error
+        raise write_error(place, _reason(error)) from error
+
+
+def write_error(place: str, reason: str) -> StoreError:
+    """The error that says that a change could not be written, and why."""
+    return StoreError(
+        f"{place}: cannot be written ({reason}); nothing of this change is in the network: "
+        "make room or mend the permissions, and give the same command again"
+    )

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import dask
 import pytest
 from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
 
 from orchestration.executors import DaskExecutor, SerialExecutor, executor_for
-from submin.errors import InputError
+from submin.errors import ClusterError, InputError
 from submin.simulation.region import simulate_region
 from submin.storage.simulated import write_region
 
@@ -22,6 +25,15 @@ def double(value: int) -> int:
 
 def fail(value: int) -> int:
     raise InputError(f"value {value} is not wanted")
+
+
+def fail_to_write(value: int) -> int:
+    raise OSError(28, "No space left on device")
+
+
+def kill_the_worker(value: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return value
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +88,32 @@ def test_a_run_on_a_scheduler_at_an_address(cluster: LocalCluster, tmp_path: Pat
 def test_no_scheduler_at_the_address_is_said() -> None:
     with pytest.raises(InputError, match="no Dask scheduler answers at"), executor_for(scheduler="tcp://127.0.0.1:9"):
         pass
+
+
+def test_what_killed_workers_held_is_computed_again() -> None:
+    """Shared values and results of tasks, after every worker has been killed at once."""
+    with executor_for(2) as executor:
+        shared = executor.share(21)
+        doubled = executor.submit_all(double, [(shared,)], "double", lambda: None)
+        workers = set(executor.client.run(os.getpid).values())  # type: ignore[attr-defined]
+        assert len(workers) == 2
+        for pid in workers:
+            os.kill(pid, signal.SIGKILL)
+        assert executor.results(executor.submit_all(double, [(doubled[0],), (shared,)], "again", lambda: None)) == [84, 42]
+        assert executor.results([shared]) == [21]
+        assert not workers & set(executor.client.run(os.getpid).values())  # type: ignore[attr-defined]
+
+
+def test_a_task_that_kills_its_workers_is_named() -> None:
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        executor_for(1) as executor,
+        pytest.raises(ClusterError, match=r"2 workers that ran the same task \(update-tile\) were killed.*fewer workers") as said,
+    ):
+        executor.submit_all(kill_the_worker, [(1,)], "update-tile", lambda: None)
+    assert "\n" not in str(said.value)
+
+
+def test_an_input_or_output_error_of_a_task_is_no_lost_scheduler(cluster: LocalCluster) -> None:
+    with Client(cluster) as client, pytest.raises(OSError, match="No space left"):
+        DaskExecutor(client).submit_all(fail_to_write, [(1,)], "fail", lambda: None)

@@ -49,7 +49,7 @@ def new(tmp_path: Path) -> str:
 
 def write(place: str, version: int, change: Any) -> None:
     """Commit one version: ``change`` gets the root."""
-    session, _ = begin_change(place)
+    session, _ = begin_change(place, Snapshot.open(place).number)
     root = zarr.open_group(session.store, mode="r+")
     change(root)
     root.attrs["version"] = version
@@ -234,7 +234,7 @@ def test_unknown_version_is_named_with_those_there_are(tmp_path: Path, version: 
 
 def test_of_two_writers_one_is_turned_away_and_leaves_nothing(tmp_path: Path) -> None:
     place = new(tmp_path)
-    sessions = [begin_change(place)[0] for _ in range(2)]
+    sessions = [begin_change(place, Snapshot.open(place).number)[0] for _ in range(2)]
     for k, session in enumerate(sessions):
         root = zarr.open_group(session.store, mode="r+")
         append_table(group_of(root, "images"), image_columns(k + 1))
@@ -249,7 +249,7 @@ def test_of_two_writers_one_is_turned_away_and_leaves_nothing(tmp_path: Path) ->
 def test_a_change_starts_from_a_version_that_it_does_not_alter(tmp_path: Path) -> None:
     place = new(tmp_path)
     write(place, 1, lambda root: append_table(group_of(root, "images"), image_columns(3)))
-    session, base = begin_change(place)
+    session, base = begin_change(place, Snapshot.open(place).number)
     root = zarr.open_group(session.store, mode="r+")
     append_table(group_of(root, "images"), image_columns(2, 3))
     number = COVER.cells_owned(1)[2]
@@ -265,13 +265,13 @@ def test_a_change_starts_from_a_version_that_it_does_not_alter(tmp_path: Path) -
 
 def test_a_change_that_is_given_up_leaves_nothing(tmp_path: Path) -> None:
     place = new(tmp_path)
-    session, _ = begin_change(place)
+    session, _ = begin_change(place, Snapshot.open(place).number)
     append_table(group_of(zarr.open_group(session.store, mode="r+"), "images"), image_columns(2))
     del session
     assert Snapshot.open(place).image_count() == 0
     assert [v.name for v in versions(place)] == ["v0"]
     with pytest.raises(StoreError, match="nowhere: no such network"):
-        begin_change(str(tmp_path / "nowhere"))
+        begin_change(str(tmp_path / "nowhere"), 0)
 
 
 # Tags
@@ -512,3 +512,11 @@ def test_packed_triangle_comes_back(size: int) -> None:
     packed = pack_lower(lower)
     assert packed.shape == (size * (size + 1) // 2,)
     np.testing.assert_array_equal(unpack_lower(packed), lower)
+
+
+def test_a_change_starts_from_the_version_that_its_ledger_was_read_from(tmp_path: Path) -> None:
+    """Where nothing keeps a second writer out, what it decided by an older ledger is refused before it computes anything."""
+    place = new(tmp_path)
+    write(place, 1, lambda root: None)
+    with pytest.raises(ConflictError, match=r"\(v1 after v0\); nothing of this change was written"):
+        begin_change(place, 0)

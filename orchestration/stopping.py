@@ -1,0 +1,84 @@
+"""Ends that come from outside: Ctrl-C, SIGTERM, a cluster that is lost. What is committed is said, and how to go on.
+
+Imports nothing that takes time: the command line must answer to Ctrl-C while it loads the rest.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+PATIENCE_SECONDS = 10.0
+SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+
+
+class Stopped(BaseException):
+    """A signal asks the command to end. Not an `Exception`: nothing on the way may take it for an error of its own."""
+
+    def __init__(self, number: int, note: str = "") -> None:
+        super().__init__(f"stopped by {SIGNALS[signal.Signals(number)]}{note}")
+        self.number = number
+
+    @property
+    def exit_code(self) -> int:
+        """As shells expect it: 130 or 143."""
+        return 128 + self.number
+
+
+@contextmanager
+def signals_stop() -> Iterator[None]:
+    """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is.
+
+    Later ones leave it to clean up in peace, for so long as that may take; then they end the process as it is, which loses nothing
+    that is committed.
+    """
+    first: float | None = None
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal first
+        if first is None:
+            first = time.monotonic()
+            raise Stopped(number)
+        if time.monotonic() - first > PATIENCE_SECONDS:
+            os._exit(Stopped(number).exit_code)
+
+    # a signal that is ignored already (a job in the background) stays ignored
+    before = {each: signal.signal(each, stop) for each in SIGNALS if signal.getsignal(each) is not signal.SIG_IGN}
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
+@contextmanager
+def resumable(place: str) -> Iterator[None]:
+    """For a body that the same command continues: when it is ended from outside, the message says what of it is in the network.
+
+    Raises
+    ------
+    Stopped, ClusterError
+        Those of the body, with that said.
+    """
+    from submin.errors import ClusterError
+
+    try:
+        yield
+    except Stopped as stopped:
+        raise Stopped(stopped.number, f"; {_committed(place)}; give the same command again to continue") from None
+    except ClusterError as error:
+        raise ClusterError(f"{error.problem}; {_committed(place)}", error.remedy) from None
+
+
+def _committed(place: str) -> str:
+    from submin.errors import SubminError
+    from submin.storage.network_store import Snapshot
+
+    try:
+        return f"everything committed stays ({place} is at {Snapshot.open(place).version})"
+    except SubminError:
+        return "nothing was written"

@@ -1,0 +1,68 @@
+"""Signals raise once, leave cleaning up in peace, and end what does not end."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from orchestration.stopping import Stopped, resumable, signals_stop
+from submin.errors import ClusterError, InputError
+
+SWALLOWS = """
+import signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from orchestration import stopping
+stopping.PATIENCE_SECONDS = 1.0
+with stopping.signals_stop():
+    while True:
+        try:
+            print("at work", flush=True)
+            time.sleep(60)
+        except BaseException as error:
+            print(type(error).__name__, flush=True)
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_the_first_signal_raises(number: signal.Signals, code: int) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # not ignored, wherever the tests are started
+    before = signal.getsignal(number)
+    with pytest.raises(Stopped) as stopped, signals_stop():
+        try:
+            signal.raise_signal(number)
+        finally:
+            signal.raise_signal(number)  # cleaning up goes on
+            cleaned = True
+    assert cleaned
+    assert stopped.value.exit_code == code
+    assert signal.getsignal(number) is before
+
+
+def test_a_program_that_swallows_the_first_signal_ends_with_a_later_one() -> None:
+    with subprocess.Popen([sys.executable, "-c", SWALLOWS], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]) as program:
+        try:
+            assert program.stdout is not None
+            lines = program.stdout
+            assert lines.readline() == "at work\n"
+            program.send_signal(signal.SIGINT)
+            assert [lines.readline(), lines.readline()] == ["Stopped\n", "at work\n"]
+            program.send_signal(signal.SIGINT)
+            time.sleep(0.3)
+            assert program.poll() is None
+            time.sleep(1.0)
+            program.send_signal(signal.SIGINT)
+            assert program.wait(10) == 130
+        finally:
+            program.kill()
+
+
+def test_what_is_not_there_was_not_written(tmp_path: Path) -> None:
+    with pytest.raises(ClusterError, match="^lost; nothing was written; try again$"), resumable(str(tmp_path / "network")):
+        raise ClusterError("lost", "try again")
+    with pytest.raises(InputError, match="^bad$"), resumable(str(tmp_path / "network")):
+        raise InputError("bad")
