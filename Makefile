@@ -1,10 +1,12 @@
 # The two commands of the README, and what they need. Only Python, git and make are expected to be there.
 PYTHON ?= python3
+# a second Python, to which networks must travel; looked for when not given
+OTHER_PYTHON ?= $(firstword $(wildcard $(HOME)/.pyenv/versions/3.13*/bin/python) $(shell command -v python3.13 2>/dev/null))
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test check environment clean
+.PHONY: demo test check environment other-environment clean
 
 demo: environment
 	rm -rf $(DEMO) && mkdir $(DEMO)
@@ -33,5 +35,14 @@ $(VENV)/.ready: pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	touch $@
 
+other-environment: $(VENV)-other/.ready
+
+$(VENV)-other/.ready: pyproject.toml
+	test -n "$(OTHER_PYTHON)" || { echo "no second Python found: give OTHER_PYTHON=..."; exit 1; }
+	$(OTHER_PYTHON) -m venv $(VENV)-other
+	$(VENV)-other/bin/python -m pip install --quiet --upgrade pip
+	$(VENV)-other/bin/python -m pip install --quiet --editable .
+	touch $@
+
 clean:
-	rm -rf $(VENV) $(DEMO) build *.egg-info
+	rm -rf $(VENV) $(VENV)-other $(DEMO) build *.egg-info

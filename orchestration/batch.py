@@ -13,6 +13,7 @@ from orchestration.change import Move, finish, place, settle, take_points
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
 from orchestration.tasks import BlockRays, FlaggedImage, adjust_blocks
+from submin.geodesy import geocentric_to_geodetic
 from submin.network.network_image import NetworkImage
 from submin.network.registration import SAME_POINT_METRES, LooseRays, together
 from submin.storage.catalogue_schema import Block
@@ -21,6 +22,8 @@ from submin.storage.ledger import Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 
 BLOCKS_A_TASK = 8
+LEAST_AGREEING = 0.5
+"""Part of a block's rays that its own adjustment must accept: fewer are no blunders in a good block."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +94,20 @@ def _stage_one(
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
     arguments = [([_block_rays(b) for b in group], base.metadata.ellipsoid) for group in groups]
     handles = executor.submit_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
-    failed = {o.block_id: o.reason for group in executor.results(handles) for o in group if o.reason is not None}
+    outcomes = [outcome for group in executor.results(handles) for outcome in group]
+    failed = {o.block_id: reason for o in outcomes if (reason := o.reason or _disagreement(o.accepted)) is not None}
     refused.extend(Rejected(block.block_id, failed[block.block_id]) for block in blocks if block.block_id in failed)
     return [block for block in blocks if block.block_id not in failed]
+
+
+def _disagreement(accepted: NDArray[np.bool_]) -> str | None:
+    """Why a block whose rays contradict each other stays out: its points would be registered where they are not, against good blocks."""
+    if accepted.sum() >= LEAST_AGREEING * len(accepted):
+        return None
+    return (
+        f"only {accepted.sum()} of the block's {len(accepted)} rays agree with each other; "
+        "check the order of sample and line, the point ids and the cameras"
+    )
 
 
 def _register(blocks: list[Block], base: Snapshot, refused: list[Rejected]) -> tuple[list[Block], Move]:
@@ -118,7 +132,9 @@ def _misplaced(blocks: Sequence[Block], rays: LooseRays, move: Move) -> dict[int
     inside = np.bincount(rays.block[~outside], minlength=len(blocks))
     for empty in np.flatnonzero(inside == 0):
         bad[int(empty)] = (
-            "the block lies wholly outside the area of the network; check the axis order, or create a network whose area holds it"
+            "the block lies wholly outside the area of the network; longitude and latitude look swapped, in the area or in its cameras"
+            if _inside_when_swapped(rays.point_ids[rays.block == empty], move)
+            else "the block lies wholly outside the area of the network; create a network whose area holds it"
         )
     far = np.flatnonzero(apart > SAME_POINT_METRES)
     if len(far):
@@ -131,6 +147,16 @@ def _misplaced(blocks: Sequence[Block], rays: LooseRays, move: Move) -> dict[int
             "one id must be one place: use other point ids (imports prefix them unless --shared-ids)",
         )
     return bad
+
+
+def _inside_when_swapped(ids: NDArray[np.str_], move: Move) -> bool:
+    """True when most of some points outside the area would be inside it, were their longitudes latitudes."""
+    arrivals = move.registration.arrivals.values()
+    origin = np.concatenate([np.empty((0, 3)), *(a.origin[np.isin(a.point_ids, ids)] for a in arrivals)])
+    geodetic = geocentric_to_geodetic(origin, move.cover.ellipsoid)
+    possible = np.abs(geodetic[:, 0]) <= 90.0
+    inside = possible & ~move.cover.outside(geodetic[:, 1], np.where(possible, geodetic[:, 0], 0.0))
+    return 2 * int(inside.sum()) > len(inside)
 
 
 def _network_images(block: Block) -> tuple[NetworkImage, ...]:

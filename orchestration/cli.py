@@ -34,12 +34,16 @@ app.add_typer(control_app, name="control")
 
 out = Console(highlight=False)
 
+MOST_WORKERS = 1024
+USAGE_ERROR: type[typer.BadParameter] = typer.BadParameter.__mro__[1]
+"""Base of all that the parser raises; newer releases of typer keep it in a private package."""
+
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 Box = Annotated[
     tuple[float, float, float, float] | None, typer.Option("--bbox", metavar="W S E N", help="West, south, east, north in degrees.")
 ]
 Aoi = Annotated[Path | None, typer.Option("--aoi", help="GeoJSON file with the area.")]
-Workers = Annotated[int, typer.Option("--workers", min=0, help="Processes of a local Dask cluster; 0 runs without one.")]
+Workers = Annotated[int, typer.Option("--workers", help="Processes of a local Dask cluster; 0 runs without one.")]
 Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")]
 
 
@@ -49,6 +53,14 @@ def show(values: dict[str, Any], as_json: bool, text: str) -> None:
         sys.stdout.write(json.dumps(values) + "\n")
     elif text:
         out.print(text, soft_wrap=True)
+
+
+def check_range(option: str, value: int, least: int, most: int | None = None) -> None:
+    """Refuse the value of an option that is out of its range."""
+    from submin.errors import InputError
+
+    if value < least or (most is not None and value > most):
+        raise InputError(f"{option} is {value}; expected {least} {'or more' if most is None else f'to {most}'}")
 
 
 @import_app.command("rpc")
@@ -161,7 +173,7 @@ def run(
     network: Annotated[str, typer.Argument(help="Network that takes them.")],
     workers: Workers = 0,
     scheduler: Scheduler = None,
-    batch_blocks: Annotated[int, typer.Option("--batch-blocks", min=1, help="Blocks that one commit holds.")] = 500,
+    batch_blocks: Annotated[int, typer.Option("--batch-blocks", help="Blocks that one commit holds.")] = 500,
     sequential: Annotated[bool, typer.Option("--sequential", help="Fuse block by block, in the order of the catalogue.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -175,6 +187,8 @@ def run(
     from orchestration.stopping import resumable
     from submin.storage.catalogue import Catalogue
 
+    check_range("--workers", workers, 0, MOST_WORKERS)
+    check_range("--batch-blocks", batch_blocks, 1)
     opened = Catalogue.open(catalogue)
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
@@ -258,7 +272,7 @@ def query(
     tile: Annotated[str | None, typer.Option("--tile", help="Name of a tile: its sub-MIN alone.")] = None,
     policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "auto",
     at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
-    max_points: Annotated[int | None, typer.Option("--max-points", min=1, help="At most so many points, well spread.")] = None,
+    max_points: Annotated[int | None, typer.Option("--max-points", help="At most so many points, well spread.")] = None,
     output: Annotated[
         Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")
     ] = None,
@@ -272,6 +286,8 @@ def query(
     from orchestration.create import read_area
     from orchestration.point_list import read_point_ids
 
+    if max_points is not None:
+        check_range("--max-points", max_points, 1)
     started = time.monotonic()
     control = submin.open(network, at).query(
         bbox=bbox, area=None if aoi is None else read_area(aoi), points=None if points is None else read_point_ids(points),
@@ -310,6 +326,7 @@ def check(
     """
     import submin
     from orchestration.check import check as compare
+    from submin.formats.replacing import replacing
     from submin.storage.point_table import read_point_table
 
     result = compare(submin.open(network), read_point_table(points), policy)
@@ -328,7 +345,7 @@ def check(
         f"when the stated covariance is exact); {result.missing} check points are not determined in the network"
     )
     if output is not None:
-        with output.open("w", encoding="utf-8") as stream:
+        with replacing(output) as temporary, temporary.open("w", encoding="utf-8") as stream:
             plain = Console(file=stream, width=160)
             plain.print(table)
             plain.print(closing, soft_wrap=True)
@@ -456,24 +473,36 @@ def _tags(version: Version) -> str:
 
 
 def main() -> None:
-    """Run the command line; an error of submin, or a signal to stop, is one line on standard error."""
+    """Run the command line; an error, or a signal to stop, is one line on standard error."""
     try:
         with signals_stop():
             from submin.errors import SubminError  # the first import that takes time
 
             try:
-                app()
-            except SubminError as error:
-                _fail(str(error), 2)
+                sys.exit(app(prog_name="submin", standalone_mode=False))
+            except (SubminError, OSError, USAGE_ERROR) as error:
+                _fail(_message(error), 2)
     except Stopped as stopped:
         _fail(str(stopped), stopped.exit_code)
 
 
-def _fail(message: str, code: int) -> NoReturn:
-    Console(stderr=True, highlight=False, markup=False).print(f"submin: {message}", soft_wrap=True)
+def _fail(said: str, code: int) -> NoReturn:
+    message = " ".join(said.split())
+    if message:  # a group of commands without one has printed its help
+        Console(stderr=True, highlight=False, markup=False).print(f"submin: {message}", soft_wrap=True)
     if "--json" in sys.argv:
         sys.stdout.write(json.dumps({"error": message}) + "\n")
     sys.exit(code)
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        return f"{name}cannot be read or written ({error.strerror or error}); check path, permissions and free space"
+    if isinstance(error, USAGE_ERROR):
+        context, said = getattr(error, "ctx", None), str(error.format_message()).rstrip(".")
+        return f"{said}; see '{context.command_path if context else 'submin'} --help'" if said else ""
+    return str(error)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,13 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
-from submin.sensors import WIDEST
-from submin.storage.catalogue import Catalogue
-from submin.storage.catalogue_schema import CatalogueMetadata
+from submin.formats.columns import required_path
+from submin.sensors import WIDEST, sensor_named
+from submin.storage.catalogue import Catalogue, read_footprint
+from submin.storage.catalogue_schema import CatalogueMetadata, ImageRecord
 from submin.storage.network_store import create_network
 from submin.storage.schema import NetworkMetadata
-from submin.tiling.cover import Cover, cover_area
+from submin.tiling.cover import Cover, check_on_globe, cover_area
 
 DEFAULT_CORE_KM = 100.0
 CORE_IN_FOOTPRINTS = 4.0
@@ -78,7 +79,7 @@ def read_area(path: Path) -> BaseGeometry:
     Raises
     ------
     InputError
-        When the file is not GeoJSON or holds no polygon.
+        When the file is not GeoJSON, holds no polygon, or one that is not on a globe or crosses itself.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -95,7 +96,12 @@ def read_area(path: Path) -> BaseGeometry:
     broken = [polygon for polygon in polygons if not polygon.is_valid]
     if broken:
         raise InputError(f"{path}: the area is not a valid polygon: {shapely.is_valid_reason(broken[0])}; mend it and try again")
-    return shapely.union_all(polygons)
+    whole = shapely.union_all(polygons)
+    try:
+        check_on_globe(whole)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return whole
 
 
 def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
@@ -104,9 +110,12 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     Raises
     ------
     InputError
-        When no image has a footprint.
+        When no image has a footprint, or one is not where its camera looks.
     """
-    footprints = [shapely.from_wkb(image.footprint) for image in catalogue.images if image.footprint]
+    footprints, path = [], required_path(catalogue.path, "images")
+    for row, image in enumerate(catalogue.images, start=1):
+        if image.footprint:
+            footprints.append(_footprint(image, f"{path}: row {row}: geometry of image {image.image_id}"))
     if not footprints:
         raise InputError(f"{catalogue.path}: no image has a footprint (column geometry); give the area by --bbox or --aoi")
     west, south, east, north = shapely.total_bounds(footprints)
@@ -114,3 +123,29 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     metres_per_degree = np.radians(1.0) * catalogue.metadata.semimajor_axis
     width = float(np.median((bounds[:, 3] - bounds[:, 1]) * metres_per_degree)) / 1000.0
     return shapely.box(west, south, east, north), CORE_IN_FOOTPRINTS * width, width
+
+
+def _footprint(image: ImageRecord, name: str) -> BaseGeometry:
+    """The footprint of an image, on the globe and not with its axes swapped."""
+    footprint = read_footprint(image.footprint, name)
+    if footprint.is_empty:
+        raise InputError(f"{name} is empty; expected a polygon in longitude and latitude")
+    west, south, east, north = footprint.bounds
+    longitude, latitude = _centre_on_ground(image)
+    x, y = 0.5 * (west + east), 0.5 * (south + north)
+    swapped = np.hypot(x - latitude, y - longitude) < 0.1 * np.hypot((x - longitude + 180.0) % 360.0 - 180.0, y - latitude)
+    if swapped or not (-90.0 <= south <= north <= 90.0 and -360.0 <= west <= east <= 360.0):
+        raise InputError(
+            f"{name} spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, but its camera looks at longitude "
+            f"{longitude:g}, latitude {latitude:g}; "
+            + ("its axes look swapped: expected longitude first, then latitude" if swapped else "expected degrees on a globe")
+        )
+    return footprint
+
+
+def _centre_on_ground(image: ImageRecord) -> tuple[float, float]:
+    """Longitude and latitude of the middle of an image, at its camera's mean height."""
+    sensor, camera = sensor_named(image.sensor), image.pack()[None]
+    sample, line = np.array([0.5 * image.width]), np.array([0.5 * image.height])
+    at = sensor.localise(camera, np.zeros(1, dtype=np.int32), sample, line, sensor.mean_height(camera))[0]
+    return float(at[0]), float(at[1])

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from submin import Network
 from submin.errors import InputError
+from submin.formats.replacing import replacing
 from submin.storage.accuracy_map import PointAccuracy, accuracy_map
 from submin.tiling.cover import Cover
 
@@ -118,11 +119,10 @@ def draw_network(network: Network, path: str | Path, *, title: str | None = None
     target = Path(path)
     if target.suffix.lower() != ".png":
         raise InputError(f"{target}: a map is written as PNG; expected a name that ends in .png")
-    if not target.parent.is_dir():
-        raise InputError(f"{target}: folder {target.parent} does not exist; create it first")
     figure = network_figure(network, title)
     # without the name and version of the program the same network gives the same file
-    figure.savefig(target, format="png", dpi=DOTS_PER_INCH, facecolor=PAPER, metadata={"Software": None})
+    with replacing(target) as temporary:
+        figure.savefig(temporary, format="png", dpi=DOTS_PER_INCH, facecolor=PAPER, metadata={"Software": None})
 
 
 def network_figure(network: Network, title: str | None = None) -> Figure:

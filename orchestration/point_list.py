@@ -21,6 +21,8 @@ def read_point_ids(path: Path) -> NDArray[np.str_]:
     InputError
         When the file cannot be read, has no such column, or holds no id.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a list of points: a column point_id, or one id a line")
     try:
         if path.suffix == ".parquet":
             ids = pq.read_table(path, columns=["point_id"])["point_id"].cast(pa.string()).to_pylist()

@@ -19,7 +19,7 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, control_point_of
 from submin.storage.ledger import Ledger
-from submin.storage.network_store import Snapshot
+from submin.storage.network_store import Snapshot, clear_write_errors
 from submin.storage.writer_lock import writing
 
 DEFAULT_BATCH_BLOCKS = 500
@@ -100,22 +100,19 @@ def run(
     BusyError
         When another process is writing to the network.
     """
-    with writing(place):
-        return _run(catalogue, place, executor, batch_blocks, reporter or Silent())
-
-
-def _run(catalogue: Catalogue, place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> RunResult:
     started = time.monotonic()
-    snapshot = Snapshot.open(place)
-    check_frames(catalogue, snapshot)
+    reporter = reporter or Silent()
+    check_frames(catalogue, Snapshot.open(place))
     summary = catalogue.validate()
     control = catalogue.points("control")
     reporter.begin(summary.blocks + (0 if control is None else len(control)))
     every = chain(
         catalogue.blocks(), () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
     )
-    tally = fuse_blocks(every, place, executor, batch_blocks, reporter)
-    return _result(Snapshot.open(place), snapshot, tally, started, executor)
+    with writing(place):
+        before = Snapshot.open(place)
+        tally = fuse_blocks(every, place, executor, batch_blocks, reporter)
+        return _result(Snapshot.open(place), before, tally, started, executor)
 
 
 def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> Tally:
@@ -125,7 +122,8 @@ def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_b
     while batch := list(islice(new, max(batch_blocks, 1))):
         good = [block for block, reason in batch if reason is None]
         refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-        tally.add(fuse_batch(place, good, refused, executor, reporter))
+        with clear_write_errors(place):
+            tally.add(fuse_batch(place, good, refused, executor, reporter))
         reporter.fused(len(batch))
     return tally
 

@@ -26,6 +26,7 @@ SUFFIXES = (".parquet", ".csv", ".csv.gz")
 BATCH_ROWS = 1 << 16
 _CSV_BLOCK_BYTES = 1 << 24
 _BROKEN_CSV_ROW = re.compile(r"Row #(\d+): (Expected .*)")
+_NOT_UTF8 = re.compile(r"Row #(\d+): .*invalid UTF8")
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,11 @@ def table_batches(path: Path, columns: Collection[Column]) -> Iterator[tuple[int
         reason = " ".join(str(error).split())
         broken = _BROKEN_CSV_ROW.search(reason)
         if broken:  # there the header is a row
-            raise CatalogueError(f"{path}: row {int(broken[1]) - 1}: {broken[2]}") from None
-        raise CatalogueError(f"{path}: cannot be read as a table ({reason})") from None
+            raise CatalogueError(f"{path}: row {int(broken[1]) - 1}: {broken[2]}; mend the row") from None
+        foreign = _NOT_UTF8.search(reason)
+        if foreign:
+            raise CatalogueError(f"{path}: row {int(foreign[1]) - 1}: text is not UTF-8; save the file in that encoding") from None
+        raise CatalogueError(f"{path}: cannot be read as a table ({reason.rstrip('.')}); write or copy it again") from None
 
 
 def read_table(path: Path, columns: Collection[Column]) -> pa.Table:

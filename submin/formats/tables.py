@@ -20,12 +20,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 from zipfile import BadZipFile
 
 import numpy as np
@@ -35,6 +33,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from submin.errors import InputError, QueryError
+from submin.formats.replacing import replacing
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
@@ -103,7 +102,7 @@ def write_parquet(path: str | Path, table: ControlTable) -> None:
     metadata = {k: v if isinstance(v, str) else json.dumps(v, ensure_ascii=False) for k, v in table.metadata.items()}
     schema = points.schema.append(pa.field("covariance_row", pa.list_(pa.float64()))).with_metadata(metadata)
     # A dictionary pays for tile names only; tried on a covariance it costs time and gains nothing.
-    with _replacing(path) as temporary, pq.ParquetWriter(temporary, schema, use_dictionary=["tile"]) as writer:
+    with replacing(path) as temporary, pq.ParquetWriter(temporary, schema, use_dictionary=["tile"]) as writer:
         for first, last in _row_groups(points.num_rows):
             rows = covariance_rows(table.covariance, first, last)
             group = points.slice(first, last - first).append_column("covariance_row", rows)
@@ -115,7 +114,7 @@ def write_npz(path: str | Path, table: ControlTable) -> None:
 
     Nothing in it is pickled. `read_npz` reads it, and so does ``numpy.load``.
     """
-    with _replacing(path) as temporary, temporary.open("wb") as file:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         arrays: dict[str, Any] = _arrays(table.columns, table.covariance, table.metadata)
         np.savez(file, **arrays)
 
@@ -137,7 +136,7 @@ def write_geojson(path: str | Path, table: ControlTable) -> None:
         }
     )
     collection = {"type": "FeatureCollection", "metadata": dict(table.metadata), "features": features.to_pylist()}
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.write_text(json.dumps(collection, ensure_ascii=False, allow_nan=False), encoding="utf-8")
 
 
@@ -146,7 +145,7 @@ def write_csv(path: str | Path, table: ControlTable) -> None:
 
     Neither the joint covariance nor the metadata is in it: for relative accuracy, or to control new images, write Parquet or ``.npz``.
     """
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         pa_csv.write_csv(_point_columns(table), str(temporary))
 
 
@@ -331,19 +330,3 @@ def _metadata(texts: Mapping[str, str], path: str | Path) -> Metadata:
         except (ValueError, TypeError):
             raise InputError(f"{path}: metadata {key!r} is {texts[key]!r}; expected JSON as written by submin") from None
     return found
-
-
-@contextmanager
-def _replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its place when all went well and is removed otherwise."""
-    target = Path(path)
-    if target.is_dir():
-        raise InputError(f"{target}: is a folder; expected the name of a file to write")
-    if not target.parent.is_dir():
-        raise InputError(f"{target}: folder {target.parent} does not exist; create it first")
-    temporary = target.with_name(f".{target.name}.{uuid4().hex}")
-    try:
-        yield temporary
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -77,7 +77,7 @@ class Registration:
     ----------
     arrivals : points by cell, with all of their rays
     directory : ids and cells of all points
-    apart : (r,) metres between the two places that those rays of a ray's point give which disagree most; infinite where none is reached
+    apart : (r,) metres between the places to which the rays of the ray's point point; infinite where a camera reaches no ground
     outside : (r,) True for rays on points outside the cover's rectangle
     """
 
@@ -109,10 +109,10 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     geodetic = geocentric_to_geodetic(origin[reached], cover.ellipsoid)
     at[reached] = cover.cells_of(geodetic[:, 0], geodetic[:, 1])
     outside[reached] = cover.outside(geodetic[:, 0], geodetic[:, 1])
-    misfit = np.full(len(point), np.inf)
-    usable = reached[point]
-    misfit[usable] = _misfit(images, local[usable], rays.observed[usable], origin[point[usable]])
-    apart = _two_largest(misfit, point, len(ids))
+    usable, compact = reached[point], np.cumsum(reached) - 1
+    apart = np.full(len(ids), np.inf)
+    if usable.any():
+        apart[reached] = _apart(images, local[usable], rays.observed[usable], compact[point[usable]], origin[reached])
 
     arrivals: dict[int, RegisteredPoints] = {}
     order = np.lexsort((np.arange(len(point)), at[point]))  # rays by cell: one pass however many cells
@@ -126,20 +126,15 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     return Registration(arrivals, (ids, at), apart[point], outside[point])
 
 
-def _two_largest(values: Array, point: NDArray[np.int64], points: int) -> Array:
-    """Sum (n,) of the two largest values of each point: rays of two places d apart pass their common point by d together."""
-    order = np.lexsort((-values, point))
-    first = np.searchsorted(point[order], np.arange(points))
-    total = values[order[first]].copy()
-    several = np.flatnonzero(np.diff(np.append(first, len(point))) > 1)
-    total[several] += values[order[first[several] + 1]]
-    return total
-
-
-def _misfit(images: ImageSet, image: NDArray[np.int32], observed: Array, ground: Array) -> Array:
-    """Metres by which rays pass given ground points (r, 3)."""
+def _apart(images: ImageSet, image: NDArray[np.int32], observed: Array, point: NDArray[np.int64], origin: Array) -> Array:
+    """Metres (n,) between the places to which the rays of each point point: how far they pass it, each in its own plane, on which sides."""
     theta = np.zeros((len(images), images.parameters))
-    rows = np.arange(len(image), dtype=np.int32)
-    projection = images.project(theta, images.ground(ground), image, rows)
-    pixels_per_metre = np.linalg.norm(projection.by_ground, axis=(1, 2)) / np.sqrt(2.0)
-    return np.asarray(np.linalg.norm(observed - projection.image, axis=1) / pixels_per_metre)
+    projection = images.project(theta, images.ground(origin), image, point.astype(np.int32))
+    b = projection.by_ground
+    square = b @ np.swapaxes(b, 1, 2)
+    square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(2)  # a view along one axis only has an empty row
+    passing = np.einsum("rck,rc->rk", b, np.linalg.solve(square, (observed - projection.image)[:, :, None])[:, :, 0])
+    order = np.argsort(point, kind="stable")
+    first = np.searchsorted(point[order], np.arange(len(origin)))
+    widest = np.maximum.reduceat(passing[order], first, axis=0) - np.minimum.reduceat(passing[order], first, axis=0)
+    return np.asarray(np.linalg.norm(widest, axis=1))

@@ -165,13 +165,19 @@ class RpcSensor:
         Raises
         ------
         InputError
-            When a value is missing, not finite, of the wrong length, or a scale is not positive.
+            When a value is missing, not finite, of the wrong length or off the globe, or a scale is not positive.
         """
         packed = np.empty(PACKED)
         for k, name in enumerate(SCALARS):
             packed[k] = _number(camera, name)
             if name.endswith("SCALE") and not packed[k] > 0.0:
                 raise InputError(f"RPC: {name} is {packed[k]:g}; expected a positive number")
+        longitude, latitude = packed[_LON_OFF], packed[_LAT_OFF]
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):
+            raise InputError(
+                f"RPC: LONG_OFF, LAT_OFF are {longitude:g}, {latitude:g}; expected degrees on a globe"
+                + ("; they look swapped" if abs(longitude) <= 90.0 and abs(latitude) <= 360.0 else "")
+            )
         for k, name in enumerate(POLYNOMIALS):
             start = _COEFFICIENTS + TERMS * k
             packed[start : start + TERMS] = _coefficients(camera, name)

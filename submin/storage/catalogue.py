@@ -16,7 +16,9 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
@@ -35,6 +37,7 @@ from submin.formats.columns import (
     text_values,
 )
 from submin.storage.catalogue_schema import (
+    CONTROL_PREFIX,
     DEFAULT_SIGMA_PX,
     POINT_KINDS,
     Block,
@@ -90,6 +93,8 @@ class Catalogue:
             When metadata, images or priors cannot be used: file, row, value, what was expected.
         """
         folder = Path(path)
+        if folder.is_file():
+            raise CatalogueError(f"{folder}: is a file; expected a catalogue (a folder with catalogue.json)")
         if not folder.is_dir():
             raise CatalogueError(f"{folder}: no such folder; expected a catalogue (a folder with catalogue.json)")
         metadata = _from_json(folder / "catalogue.json", CatalogueMetadata.from_mapping)
@@ -175,8 +180,12 @@ class Catalogue:
                 image.pack()
             except InputError as error:
                 raise CatalogueError(f"{path}: row {row}: {error}") from None
+            if image.footprint:
+                read_footprint(image.footprint, f"{path}: row {row}: geometry of image {image.image_id}")
         path = required_path(self.path, "measurements")
         rays = sum(len(self._image_index(block_id, row, table, path)) for block_id, row, table in _runs(path))
+        if not rays:
+            raise CatalogueError(f"{path}: holds no measurements; expected at least one row")
         for kind in _COVARIANCE_OF:
             self.points(kind)
         return CatalogueSummary(self.block_count, len(self.images), rays)
@@ -207,7 +216,17 @@ class Catalogue:
             number_values(table, "line"),
             number_values(table, "sigma_sample", DEFAULT_SIGMA_PX),
             number_values(table, "sigma_line", DEFAULT_SIGMA_PX),
+            path.name,
+            row,
         )
+
+
+def read_footprint(footprint: bytes, name: str) -> BaseGeometry:
+    """The polygon of a footprint that ``name`` names in errors; raises `CatalogueError` when it is not WKB."""
+    try:
+        return shapely.from_wkb(footprint)
+    except shapely.GEOSException as error:
+        raise CatalogueError(f"{name} is not WKB ({error}); expected a polygon in longitude and latitude") from None
 
 
 def _runs(path: Path) -> Iterator[tuple[str, int, pa.Table]]:
@@ -242,7 +261,7 @@ def _from_json(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:
     except FileNotFoundError:
         raise CatalogueError(f"{path}: no such file; expected the metadata of a catalogue") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CatalogueError(f"{path}: is not JSON ({error})") from None
+        raise CatalogueError(f"{path}: is not JSON ({error}); expected a JSON object in UTF-8") from None
     except InputError as error:
         raise CatalogueError(f"{path}: {error}") from None
 
@@ -278,6 +297,11 @@ def _read_images(path: Path) -> tuple[ImageRecord, ...]:
             raise CatalogueError(
                 f"{path}: row {row}: image_id {image.image_id!r} is that of row {first_row[image.image_id]} too; expected it once"
             )
+        for name, value in (("image_id", image.image_id), ("block_id", image.block_id)):
+            if value.startswith(CONTROL_PREFIX):
+                raise CatalogueError(
+                    f"{path}: row {row}: {name} is {value!r}; expected another one: {CONTROL_PREFIX!r} begins those of control points"
+                )
         first_row[image.image_id] = row
         images.append(image)
     if not images:
@@ -287,5 +311,5 @@ def _read_images(path: Path) -> tuple[ImageRecord, ...]:
 
 __all__ = [
     "IMAGE_COLUMNS", "MEASUREMENT_COLUMNS",
-    "Block", "Catalogue", "CatalogueMetadata", "CatalogueSummary", "ImageRecord", "PointTable", "defects",
+    "Block", "Catalogue", "CatalogueMetadata", "CatalogueSummary", "ImageRecord", "PointTable", "defects", "read_footprint",
 ]  # fmt: skip

@@ -27,11 +27,15 @@ Index = NDArray[np.int32]
 Ids = NDArray[np.str_]
 
 FORMAT_VERSION = 1
+LEAST_RAYS = 3
+"""A block with fewer rays ties nothing to anything: more likely a table cut short than a block."""
 DEFAULT_SIGMA_PX = 0.5
 """Standard deviation of a measured image coordinate for which a catalogue gives none, pixels."""
 
 COVARIANCE_COLUMNS = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 SIGMA_COLUMNS = ("sigma_e", "sigma_n", "sigma_u")
+CONTROL_PREFIX = "control:"
+"""Begins the block and image ids of control points; no catalogue may use it."""
 POINT_KINDS = ("control", "check", "truth")
 
 _COMPACT_UTC = re.compile(r"(\d{14})(\.\d+)?")
@@ -238,6 +242,7 @@ class Block:
     image : (r,) index into ``images``
     sample, line : (r,) measured image coordinates, pixels
     sigma_sample, sigma_line : (r,) their standard deviations, pixels
+    source, first_row : file that holds the rays, and its row of the first one, for messages; empty when they come from no file
     """
 
     block_id: str
@@ -249,6 +254,8 @@ class Block:
     line: Array
     sigma_sample: Array
     sigma_line: Array
+    source: str = ""
+    first_row: int = 1
 
     def __post_init__(self) -> None:
         shapes = {name: np.shape(getattr(self, name)) for name in ("point_ids", "image", *_MEASURED)}
@@ -286,10 +293,11 @@ class Block:
 def defects(block: Block) -> str | None:
     """Why a block cannot be used as it is, in one line, or None: an error inside one block rejects that block and no other."""
     if not len(block):
-        return "the block has no measurements"
+        return "the block has no measurements; measure it, or remove its images"
 
     def ray(r: int) -> str:
-        return f"point {block.point_ids[r]} in image {block.images[block.image[r]].image_id}"
+        place = f"{block.source}: row {block.first_row + r}: " if block.source else ""
+        return f"{place}point {block.point_ids[r]} in image {block.images[block.image[r]].image_id}"
 
     for name in _MEASURED:
         values = getattr(block, name)
@@ -310,6 +318,9 @@ def defects(block: Block) -> str | None:
     counts = np.bincount(block.image, minlength=len(block.images))
     if (counts == 0).any():
         return f"image {block.images[int(np.argmin(counts))].image_id} has no measurements; expected some in every image of the block"
+    if block.a_priori is not None and len(block) < LEAST_RAYS:
+        found = f"{len(block)} ray{'s' * (len(block) > 1)}"
+        return f"the block has {found}; expected at least {LEAST_RAYS}: measure more, or join it to another block"
     if block.a_priori is not None and block.a_priori.correlation in ("exponential", "gaussian"):
         for image in block.images:
             if not image.acquired:

@@ -49,7 +49,7 @@ class CatalogueWriter:
     Raises
     ------
     CatalogueError
-        When the folder holds something already.
+        When the folder holds something already, or cannot be written (a full disk, no permission).
     """
 
     def __init__(self, path: str | Path, metadata: CatalogueMetadata, overwrite: bool = False) -> None:
@@ -66,12 +66,16 @@ class CatalogueWriter:
         self._measurements: pq.ParquetWriter | None = None
 
     def __enter__(self) -> Self:
-        self._place.parent.mkdir(parents=True, exist_ok=True)
-        self._folder.mkdir()
-        images = _schema(IMAGE_COLUMNS).with_metadata(_geoparquet(self.metadata.body))
-        self._images = pq.ParquetWriter(self._folder / "images.parquet", images, compression="zstd")
-        self._measurements = pq.ParquetWriter(self._folder / "measurements.parquet", _schema(MEASUREMENT_COLUMNS), compression="zstd")
-        self._json("catalogue.json", self.metadata.to_mapping())
+        try:
+            self._place.parent.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir()
+            images = _schema(IMAGE_COLUMNS).with_metadata(_geoparquet(self.metadata.body))
+            self._images = pq.ParquetWriter(self._folder / "images.parquet", images, compression="zstd")
+            self._measurements = pq.ParquetWriter(self._folder / "measurements.parquet", _schema(MEASUREMENT_COLUMNS), compression="zstd")
+            self._json("catalogue.json", self.metadata.to_mapping())
+        except OSError as cause:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise self._unwritable(cause) from cause
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -83,6 +87,10 @@ class CatalogueWriter:
             measurements.close()
             if kind is None:
                 self._take_place()
+            elif isinstance(error, OSError):
+                raise self._unwritable(error) from error
+        except OSError as cause:
+            raise self._unwritable(cause) from cause
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -141,6 +149,11 @@ class CatalogueWriter:
             if points.joint_covariance is not None:
                 columns["covariance_row"] = covariance_rows(points.joint_covariance, 0, len(points))
         pq.write_table(pa.table(columns), self._folder / f"{kind}.parquet", compression="zstd")
+
+    def _unwritable(self, cause: OSError) -> CatalogueError:
+        return CatalogueError(
+            f"{self.path}: cannot be written ({cause.strerror or cause}); make room there, mend the permissions, or choose another place"
+        )
 
     def _open(self) -> tuple[pq.ParquetWriter, pq.ParquetWriter]:
         if self._images is None or self._measurements is None:

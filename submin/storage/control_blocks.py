@@ -9,10 +9,7 @@ import numpy as np
 
 from submin.errors import InputError
 from submin.geodesy import Ellipsoid, geodetic_to_geocentric, local_axes
-from submin.storage.catalogue_schema import Block, ImageRecord, PointTable
-
-CONTROL_PREFIX = "control:"
-"""Begins the block and image ids of control points; no catalogue may use it."""
+from submin.storage.catalogue_schema import CONTROL_PREFIX, Block, ImageRecord, PointTable
 
 
 def control_block_id(point_id: str) -> str:

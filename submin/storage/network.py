@@ -97,6 +97,10 @@ class Network:
             area = box_area(bbox)
         if area is not None:
             selections = points_in_area(self, area)
+            if not selections and _inside_when_swapped(area, self.cover):
+                raise QueryError(
+                    "the area queried is outside the network, and inside it with its axes swapped; expected longitude first, then latitude"
+                )
         elif points is not None:
             ids = np.unique(np.asarray(points, dtype=np.str_))
             selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids))
@@ -212,7 +216,8 @@ def box_area(bbox: tuple[float, float, float, float]) -> BaseGeometry:
         When the numbers are no box on a globe.
     """
     west, south, east, north = bbox
-    if not (np.isfinite(bbox).all() and -90.0 <= south < north <= 90.0 and -180.0 <= west <= 180.0 and -180.0 <= east <= 180.0):
+    globe = -90.0 <= south < north <= 90.0 and -180.0 <= west <= 180.0 and -180.0 <= east <= 180.0
+    if not (np.isfinite(bbox).all() and globe and west != east):
         swapped = -90.0 <= west < east <= 90.0 and abs(south) > 90.0
         raise QueryError(
             f"bbox is {west:g} {south:g} {east:g} {north:g}; expected west south east north in degrees"
@@ -221,6 +226,15 @@ def box_area(bbox: tuple[float, float, float, float]) -> BaseGeometry:
     if west > east:
         return shapely.union_all([shapely.box(west, south, 180.0, north), shapely.box(-180.0, south, east, north)])
     return shapely.box(west, south, east, north)
+
+
+def _inside_when_swapped(area: BaseGeometry, cover: Cover) -> bool:
+    """True when the middle of an area is outside the cover, and inside it with longitude and latitude exchanged."""
+    middle = shapely.box(*area.bounds).centroid
+    longitude, latitude = np.array([middle.x]), np.array([middle.y])
+    if area.is_empty or abs(middle.x) > 90.0:
+        return False
+    return bool(cover.outside(longitude, latitude)[0] and not cover.outside(latitude, longitude)[0])
 
 
 def open_network(path: str | Path, version: str | None = None) -> Network:

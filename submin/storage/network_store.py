@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
+from inspect import signature
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import icechunk
 import numpy as np
@@ -33,6 +37,8 @@ from submin.tiling.cover import Cover
 
 icechunk.set_logs_filter("icechunk=error")
 BRANCH = "main"
+_FIRST_FORMAT: dict[str, Any] = {"spec_version": 1} if "spec_version" in signature(icechunk.Repository.create).parameters else {}
+"""Icechunk 2 (which needs Python 3.12) reads and writes both formats, Icechunk 1 only the first: networks must travel."""
 _TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
 READ_OVER_ROWS = 256
 
@@ -61,12 +67,22 @@ def _storage(place: str) -> icechunk.Storage:
 
 
 def _open_repository(place: str) -> icechunk.Repository:
+    if "://" not in place and Path(place).is_file():
+        raise StoreError(f"{place}: is a file; expected the folder of a network: make one with 'submin create'")
     if "://" not in place and not Path(place).is_dir():
         raise StoreError(f"{place}: no such network; make one with 'submin create'")
     try:
         return icechunk.Repository.open(_storage(place))
     except icechunk.IcechunkError as error:
-        raise StoreError(f"{place}: not a network ({str(error).strip().splitlines()[0]}); make one with 'submin create'") from None
+        raise StoreError(f"{place}: not a network ({_reason(error)}); make one with 'submin create'") from None
+
+
+def _reason(error: Exception) -> str:
+    """The innermost cause: Icechunk tells causes a line each, from the outside in."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    lines = [line.strip(" │├╰─|`->") for line in str(error).splitlines()]
+    return next((line for line in reversed(lines) if line), type(error).__name__)
 
 
 def create_network(place: str, metadata: NetworkMetadata) -> Version:
@@ -79,11 +95,14 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
     """
     if "://" not in place and Path(place).exists() and (not Path(place).is_dir() or any(Path(place).iterdir())):
         raise StoreError(f"{place}: already exists; choose another place, or remove it first")
+    remote, folder = "://" in place, Path(place)
+    # made beside the folder that is meant, or in it where it exists (it may be a mount), and moved there when all is written
+    beside = folder if folder.is_dir() else folder.absolute().parent
+    making = place if remote else str(beside / f".{uuid4().hex}")
     try:
-        if "://" not in place:  # Icechunk panics where it cannot make the folder
-            Path(place).mkdir(parents=True, exist_ok=True)
-        repository = icechunk.Repository.create(_storage(place))
-        session = repository.writable_session(BRANCH)
+        if not remote:  # Icechunk panics where it cannot make the folder
+            Path(making).mkdir(parents=True)
+        session = icechunk.Repository.create(_storage(making), **_FIRST_FORMAT).writable_session(BRANCH)
         root = zarr.create_group(session.store, attributes=metadata.to_attributes() | {"version": 0})
         root.create_group("cells")
         root.create_group("tiles")
@@ -92,8 +111,18 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
         create_table(root, "directory", DIRECTORY_COLUMNS)
         create_table(root, "flags", FLAG_COLUMNS)
         session.commit("created", metadata={"version": 0})
+        if folder.is_dir():
+            for part in sorted(Path(making).iterdir(), key=lambda path: path.name == "refs"):  # which make it a repository
+                part.rename(folder / part.name)
+        elif not remote:
+            Path(making).rename(folder)
     except (icechunk.IcechunkError, OSError) as error:
-        raise StoreError(f"{place}: cannot be written ({str(error).strip().splitlines()[0]})") from error
+        raise StoreError(
+            f"{place}: cannot be written ({_reason(error)}); make room there, mend the permissions, or choose another place"
+        ) from error
+    finally:
+        if not remote:
+            shutil.rmtree(making, ignore_errors=True)
     return versions(place)[0]
 
 
@@ -136,11 +165,12 @@ def tag_version(place: str, tag: str, name: str | None = None) -> Version:
     """
     if not _TAG.fullmatch(tag) or _OWN_NAME.fullmatch(tag):
         raise StoreError(f"tag is {tag!r}; expected a word of letters, digits, '.', '_' and '-' that is no version's own name such as v12")
+    for known in versions(place):
+        if tag in known.tags:
+            raise StoreError(f"{place}: tag {tag!r} is that of {known.name}; expected a new one: a tag is given once")
     version = versions(place)[0] if name is None else find_version(place, name)
-    try:
+    with clear_write_errors(place):
         _open_repository(place).create_tag(tag, snapshot_id=version.snapshot)
-    except icechunk.IcechunkError as error:
-        raise StoreError(f"{place}: tag {tag!r} cannot be made ({str(error).strip().splitlines()[0]}); a tag is given once") from None
     return replace(version, tags=(*version.tags, tag))
 
 
@@ -277,3 +307,21 @@ def begin_change(place: str) -> tuple[icechunk.Session, Snapshot]:
     session = repository.writable_session(BRANCH)
     base = repository.readonly_session(snapshot_id=session.snapshot_id)
     return session, Snapshot(zarr.open_group(base.store, mode="r"), place)
+
+
+@contextmanager
+def clear_write_errors(place: str) -> Iterator[None]:
+    """Say in one line that a batch could not be written: a full disk, a folder without permission, a store that is gone.
+
+    Raises
+    ------
+    StoreError
+        In place of what the store raised; nothing of the batch is in the network then.
+    """
+    try:
+        yield
+    except icechunk.IcechunkError as error:
+        raise StoreError(
+            f"{place}: cannot be written ({_reason(error)}); nothing of this change is in the network: "
+            "make room or mend the permissions, and give the same command again"
+        ) from error

@@ -46,20 +46,34 @@ def writing(place: str) -> Iterator[None]:
         # opened as it is: what the holder has written there must stay, should this process be refused
         file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b", buffering=0)
     except OSError as error:
-        raise StoreError(f"{place}: cannot be written ({error.strerror})") from None
+        raise _unwritable(place, error) from None
     with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BusyError(f"{place}: {_holder(file)} is writing to this network; wait until it ends, or stop it, and try again") from None
-        except OSError as error:
-            if error.errno not in NO_LOCKS_HERE:
-                raise StoreError(f"{place}: cannot be locked for writing ({error.strerror})") from None
-        _enter(file)
+        _lock(file, place)
         try:
             yield
         finally:
             file.truncate(0)
+
+
+def _lock(file: BinaryIO, place: str) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise BusyError(f"{place}: {_holder(file)} is writing to this network; wait until it ends, or stop it, and try again") from None
+    except OSError as error:
+        if error.errno not in NO_LOCKS_HERE:
+            raise _unwritable(place, error) from None
+    try:
+        _enter(file)
+    except OSError as error:
+        raise _unwritable(place, error) from None
+
+
+def _unwritable(place: str, error: OSError) -> StoreError:
+    return StoreError(
+        f"{place}: cannot be written ({error.strerror}); nothing of this change is in the network: "
+        "make room or mend the permissions, and give the same command again"
+    )
 
 
 def _enter(file: BinaryIO) -> None:

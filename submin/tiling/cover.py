@@ -215,6 +215,14 @@ class Cover:
         """Side of a tile's core, metres."""
         return float(self.core / 2 ** self._address(int(tile))[0])
 
+    def _is_tile(self, tile: int) -> bool:
+        whole = tile
+        while whole >= self._base:
+            whole = (whole - self._base) // 4
+            if whole not in self.splits:
+                return False
+        return whole >= 0 and tile not in self.splits
+
     def can_split(self, tile: int) -> bool:
         """True when the quarters of a core are still as wide as the overlap."""
         level = self._address(int(tile))[0]
@@ -229,8 +237,10 @@ class Cover:
             When the tile is none of the cover, or its quarters would be narrower than the overlap.
         """
         tile, cover = int(tile), self
-        if tile in self.splits or not self.can_split(tile):
-            raise InputError(f"tile {self.tile_name(tile)} cannot be split: its quarters would be narrower than the overlap")
+        if not self._is_tile(tile):
+            raise InputError(f"tile is {tile}, which is none of the cover; expected one of its {self.tile_count} tiles")
+        if not self.can_split(tile):
+            raise InputError(f"tile {self.tile_name(tile)} cannot be split: its quarters would be narrower than the overlap, or too many")
         level = self._address(tile)[0]
         while larger := [t for t in cover.neighbours(tile) if cover._address(t)[0] < level]:
             cover = cover.split(larger[0])
@@ -370,17 +380,9 @@ def cover_area(area: BaseGeometry, core: float, overlap: float, ellipsoid: Ellip
     InputError
         When the area is empty, crosses itself, or has coordinates that cannot be longitudes and latitudes.
     """
-    if area.is_empty:
-        raise InputError("the area is empty; expected a polygon in longitude and latitude")
     if not area.is_valid:
         raise InputError(f"the area is not a valid polygon: {shapely.is_valid_reason(area)}; mend it and try again")
-    west, south, east, north = area.bounds
-    if not (-90.0 <= south <= north <= 90.0 and -360.0 <= west <= east <= 360.0):
-        swapped = -90.0 <= west <= east <= 90.0
-        raise InputError(
-            f"the area spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, which is not on a globe"
-            + ("; its axes look swapped: expected longitude first, then latitude" if swapped else "")
-        )
+    check_on_globe(area)
     area = _unwrapped(area)
     west, south, east, north = area.bounds
     centre = (0.5 * (west + east), 0.5 * (south + north))
@@ -392,10 +394,22 @@ def cover_area(area: BaseGeometry, core: float, overlap: float, ellipsoid: Ellip
             "the area reaches to the point opposite its middle, where no equal-area plane reaches; take less than a hemisphere"
         )
     # A touch of tolerance: an area of exactly three cores is three cores, not four.
-    columns = max(int(np.ceil((x.max() - x.min()) / core - 1e-3)), 1)
-    rows = max(int(np.ceil((y.max() - y.min()) / core - 1e-3)), 1)
+    columns, rows = (max(int(np.ceil(min(float(np.ptp(v)) / core, 1e12) - 1e-3)), 1) for v in (x, y))
     origin = (0.5 * (x.max() + x.min()) - 0.5 * columns * core, 0.5 * (y.max() + y.min()) - 0.5 * rows * core)
     return Cover(centre, origin, rows, columns, core, overlap, ellipsoid)
+
+
+def check_on_globe(area: BaseGeometry) -> None:
+    """Raise `InputError` for an area that is empty, or whose coordinates cannot be longitudes and latitudes, in this order."""
+    if area.is_empty:
+        raise InputError("the area is empty; expected a polygon in longitude and latitude")
+    west, south, east, north = area.bounds
+    if not (-90.0 <= south <= north <= 90.0 and -360.0 <= west <= east <= 360.0):
+        swapped = -90.0 <= west <= east <= 90.0
+        raise InputError(
+            f"the area spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, which is not on a globe"
+            + ("; its axes look swapped: expected longitude first, then latitude" if swapped else "")
+        )
 
 
 def _unwrapped(area: BaseGeometry) -> BaseGeometry:

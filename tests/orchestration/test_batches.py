@@ -7,82 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from networks import SMALL, accepted_rays, area_of, fuse
+from networks import accepted_rays, area_of, by_image, fuse, rewrite, same_network
 
 import submin
 from orchestration.executors import executor_for
-from submin.simulation.region import SimulatedRegion, simulate_region
+from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
-from submin.storage.catalogue_schema import Block
-from submin.storage.catalogue_writer import CatalogueWriter
 from submin.storage.network_store import Snapshot, versions
-from submin.storage.simulated import write_region
-
-
-@pytest.fixture(scope="module")
-def region() -> SimulatedRegion:
-    return simulate_region(SMALL)
-
-
-@pytest.fixture(scope="module")
-def catalogue(region: SimulatedRegion, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("region") / "catalogue"
-    write_region(region, path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def base(region: SimulatedRegion, catalogue: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    network = tmp_path_factory.mktemp("base") / "network"
-    fuse(catalogue, network, area_of(region))
-    return network
-
-
-def rewrite(catalogue: Path, out: Path, blocks: list[Block]) -> Path:
-    """A catalogue of the same metadata with these blocks."""
-    source = Catalogue.open(catalogue)
-    with CatalogueWriter(out, source.metadata) as writer:
-        writer.write_images(image for block in blocks for image in block.images)
-        for block in blocks:
-            writer.write_block(block)
-        writer.write_priors(source.default_prior, source.priors)
-    return out
-
-
-def by_image(block: Block) -> list[Block]:
-    """One block for every image of a block."""
-    parts = []
-    for k, image in enumerate(block.images):
-        rows = block.image == k
-        parts.append(
-            Block(
-                image.image_id,
-                (dataclasses.replace(image, block_id=image.image_id),),
-                block.a_priori,
-                block.point_ids[rows],
-                np.zeros(rows.sum(), dtype=np.int32),
-                block.sample[rows],
-                block.line[rows],
-                block.sigma_sample[rows],
-                block.sigma_line[rows],
-            )
-        )
-    return parts
-
-
-def same_network(one: Path, other: Path) -> None:
-    """Two networks hold the same rays and give the same rigorous answer for all points, and each tile the same answer alone."""
-    assert accepted_rays(one) == accepted_rays(other)
-    first, second = submin.open(one), submin.open(other)
-    assert first.snapshot.tile_numbers() == second.snapshot.tile_numbers()
-    questions = [{"bbox": (90.0, 30.0, 110.0, 40.0), "policy": "rigorous"}]
-    questions += [{"tile": first.cover.tile_name(tile)} for tile in first.snapshot.tile_numbers()]
-    for question in questions:
-        a, b = first.query(**question), second.query(**question)
-        assert a.ids.tolist() == b.ids.tolist()
-        sigma = np.sqrt(np.diag(a.covariance))
-        assert (np.abs(a.geocentric - b.geocentric).ravel() / sigma).max(initial=0.0) < 1e-9
-        assert (np.abs(a.covariance - b.covariance) / sigma / sigma[:, None]).max(initial=0.0) < 1e-9
 
 
 def test_every_ray_is_in_one_cell(region: SimulatedRegion, base: Path) -> None:

@@ -14,15 +14,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 from numpy.typing import NDArray
 
+from submin.adjustment.rays import Rays
 from submin.network.network_image import NetworkImage
-from submin.sensors import Ground, sensor_named
+from submin.sensors import Ground, Projection, sensor_named
 from submin.storage.network import Network
 from submin.tiling.cover import Cover
 
@@ -77,7 +78,8 @@ class Information:
 
 def equations(network: Network) -> Equations:
     """The linear problem of a network, from the rays, linearisation and images that it keeps."""
-    images = network.snapshot.images()
+    withdrawn = network.snapshot.image_columns(["withdrawn"])["withdrawn"]
+    images = [replace(i, a_priori="") if w else i for i, w in zip(network.snapshot.images(), withdrawn, strict=True)]
     ellipsoid = network.snapshot.metadata.ellipsoid
     factor = a_priori_factor(images)
     p = factor.shape[0] // len(images)
@@ -89,11 +91,7 @@ def equations(network: Network) -> Equations:
         count = np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell))
         rays = cell.rays.take(cell.rays.accepted & (count >= 2)[cell.rays.point])
         of_cell = [images[row] for row in cell.images]
-        assert {image.sensor for image in of_cell} <= {"rpc"}
-        sensor = sensor_named("rpc")
-        cameras = np.stack([sensor.pack(json.loads(i.camera), i.width, i.height) for i in of_cell])
-        ground = Ground.at(cell.linearised_at, ellipsoid)
-        projection = sensor.project(cameras, cell.theta, ground, rays.image, rays.point, rays.observed)
+        projection = projected(of_cell, cell.theta, Ground.at(cell.linearised_at, ellipsoid), rays)
         moved = (cell.linearised_at - cell.origin)[rays.point]
         reduced = (
             rays.observed - projection.image
@@ -123,24 +121,41 @@ def equations(network: Network) -> Equations:
     )  # fmt: skip
 
 
+def projected(images: Sequence[NetworkImage], theta: Array, ground: Ground, rays: Rays) -> Projection:
+    """Image coordinates and partials of all rays, image by image."""
+    r, p = len(rays), theta.shape[1]
+    whole = Projection(np.empty((r, 2)), np.empty((r, 2, 3)), np.zeros((r, 2, p)))
+    for k, image in enumerate(images):
+        of_image, sensor = np.flatnonzero(rays.image == k), sensor_named(image.sensor)
+        camera = sensor.pack(json.loads(image.camera), image.width, image.height)[None]
+        first = np.zeros(len(of_image), dtype=np.int32)
+        part = sensor.project(camera, theta[k : k + 1], ground, first, rays.point[of_image], rays.observed[of_image])
+        whole.image[of_image], whole.by_ground[of_image] = part.image, part.by_ground
+        whole.by_parameters[of_image, :, : len(sensor.parameters)] = part.by_parameters
+    return whole
+
+
 def a_priori_factor(images: Sequence[NetworkImage]) -> Array:
     """K (m p, q), dense: own parts of the images of a block by a Cholesky factor of their correlation, then two columns a pass.
 
     A released image has a hundred times the sigmas, and no correlation with its block (docs/decisions/004-blunders-and-bad-cameras.md).
+    A survey has nothing to adjust, and a withdrawn image is not there: their rows are zero.
     """
-    m, p = len(images), sensor_named("rpc").parameters
+    m, p = len(images), len(sensor_named("rpc").parameters)
     bias = np.isin(np.arange(p), sensor_named("rpc").bias)
-    models = [json.loads(image.a_priori) for image in images]
+    models = [json.loads(image.a_priori) if image.a_priori else None for image in images]
     passes = list(dict.fromkeys(image.pass_id for image in images))
     factor = np.zeros((m, p, m * p + 2 * len(passes)))
     for i, image in enumerate(images):
+        if models[i] is None:
+            continue
         column = m * p + 2 * passes.index(image.pass_id)
         factor[i, np.flatnonzero(bias), [column, column + 1]] = models[i]["bias_px"] * np.sqrt(models[i]["common_to_pass"])
         if image.released:
             sigma = np.where(bias, models[i]["bias_px"], models[i]["drift_px"])
             factor[i, np.arange(p), p * i + np.arange(p)] = RELEASED * sigma
     for block in dict.fromkeys(image.block_id for image in images):
-        members = [i for i, image in enumerate(images) if image.block_id == block and not image.released]
+        members = [i for i, image in enumerate(images) if image.block_id == block and not image.released and models[i] is not None]
         seconds = np.array([images[i].seconds for i in members])
         for a, row in enumerate(np.linalg.cholesky(correlation(models[members[0]], seconds)) if members else ()):
             model = models[members[a]]

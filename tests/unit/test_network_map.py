@@ -31,7 +31,7 @@ RED = np.array([0xD7, 0x26, 0x3D]) / 255.0
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[submin.Network, RunResult]:
     """A network of four tiles and twelve images with one bad camera."""
     folder = tmp_path_factory.mktemp("map")
-    region = simulate_region(RegionDesign(width_km=60.0, height_km=60.0, point_spacing_km=6.0, bad_camera_sigmas=30.0))
+    region = simulate_region(RegionDesign(width_km=60.0, height_km=60.0, point_spacing_km=6.0, bad_camera_sigmas=20.0))
     write_region(region, folder / "catalogue")
     result = fuse(folder / "catalogue", folder / "network", area_of(region), tile_km=40.0, overlap_km=15.0)
     return submin.open(folder / "network"), result

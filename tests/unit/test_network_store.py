@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell
 from submin.network.sub_min import SubMin
 from submin.storage.arrays import append_table, group_of, hash_ids
-from submin.storage.network_store import Snapshot, commit, create_network, versions, writable_session
+from submin.storage.network_store import Snapshot, begin_change, commit, create_network, find_version, tag_version, versions
 from submin.storage.schema import (
     FORMAT_VERSION,
     IMAGE_COLUMNS,
@@ -48,7 +49,7 @@ def new(tmp_path: Path) -> str:
 
 def write(place: str, version: int, change: Any) -> None:
     """Commit one version: ``change`` gets the root."""
-    session = writable_session(place)
+    session, _ = begin_change(place)
     root = zarr.open_group(session.store, mode="r+")
     change(root)
     root.attrs["version"] = version
@@ -65,19 +66,19 @@ def random_cell(number: int, seed: int = 1, points: int = 5) -> Cell:
     )  # fmt: skip
     return Cell(
         number, np.array([f"SET/点{i}" for i in range(points)]), rng.normal(0.0, 4e6, (points, 3)), rng.normal(0.0, 4e6, (points, 3)),
-        rng.uniform(size=points) < 0.5, images, rng.normal(size=(4, 6)), rays,
+        images, rng.normal(size=(4, 6)), rays,
         Sums(np.tril(rng.normal(size=(24, 24))), rng.normal(size=24), 12.5, 17),
     )  # fmt: skip
 
 
 def assert_same_cell(found: Cell, expected: Cell) -> None:
     assert found.number == expected.number
-    for name in ("point_ids", "origin", "linearised_at", "final", "images", "theta"):
+    for name in ("point_ids", "origin", "linearised_at", "images", "theta"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     for name in ("point", "image", "observed", "sigma", "accepted"):
         np.testing.assert_array_equal(getattr(found.rays, name), getattr(expected.rays, name))
         assert getattr(found.rays, name).dtype == getattr(expected.rays, name).dtype
-    assert found.final.dtype == expected.final.dtype and found.images.dtype == expected.images.dtype
+    assert found.images.dtype == expected.images.dtype
 
 
 def image_columns(count: int, first: int = 0) -> dict[str, NDArray[Any]]:
@@ -103,7 +104,8 @@ def test_new_network_is_version_zero_and_empty(tmp_path: Path) -> None:
     assert snapshot.cover == COVER
     assert (snapshot.cell_numbers(), snapshot.tile_numbers(), snapshot.image_count(), snapshot.flags()) == ((), (), 0, set())
     assert snapshot.images() == [] and len(snapshot.ledger()["block_id"]) == 0
-    assert len(snapshot.cell(7)) == 0 and snapshot.cell(7).number == 7
+    number = COVER.cells_owned(1)[2]
+    assert len(snapshot.cell(number)) == 0 and snapshot.cell(number).number == number
     np.testing.assert_array_equal(snapshot.candidate_cells(np.array(["a", "b"])), [-1, -1])
     assert len(snapshot.candidate_cells(np.empty(0, dtype="U1"))) == 0
 
@@ -141,11 +143,25 @@ def test_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         create_network(str(tmp_path / "file" / "network"), METADATA)
 
 
+def test_an_empty_folder_becomes_a_network_and_keeps_nothing_of_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "network").mkdir()
+
+    def full(*args: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    for place in ("network", "other"):
+        with monkeypatch.context() as patch, pytest.raises(StoreError, match=rf"{place}: cannot be written \(No space left on device\)"):
+            patch.setattr("submin.storage.network_store.create_table", full)
+            create_network(str(tmp_path / place), METADATA)
+    assert [path.name for path in tmp_path.rglob("*")] == ["network"]
+    assert Snapshot.open(new(tmp_path)).version == "v0"
+
+
 def test_what_is_not_a_network_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere: no such network; make one with 'submin create'"):
         Snapshot.open(str(tmp_path / "nowhere"))
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(StoreError, match="file: no such network"):
+    with pytest.raises(StoreError, match="file: is a file; expected the folder of a network"):
         Snapshot.open(str(tmp_path / "file"))
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "letter").write_text("mine")
@@ -218,7 +234,7 @@ def test_unknown_version_is_named_with_those_there_are(tmp_path: Path, version: 
 
 def test_of_two_writers_one_is_turned_away_and_leaves_nothing(tmp_path: Path) -> None:
     place = new(tmp_path)
-    sessions = [writable_session(place) for _ in range(2)]
+    sessions = [begin_change(place)[0] for _ in range(2)]
     for k, session in enumerate(sessions):
         root = zarr.open_group(session.store, mode="r+")
         append_table(group_of(root, "images"), image_columns(k + 1))
@@ -230,6 +246,124 @@ def test_of_two_writers_one_is_turned_away_and_leaves_nothing(tmp_path: Path) ->
     assert Snapshot.open(place).image_count() == 1
 
 
+def test_a_change_starts_from_a_version_that_it_does_not_alter(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    write(place, 1, lambda root: append_table(group_of(root, "images"), image_columns(3)))
+    session, base = begin_change(place)
+    root = zarr.open_group(session.store, mode="r+")
+    append_table(group_of(root, "images"), image_columns(2, 3))
+    number = COVER.cells_owned(1)[2]
+    write_cell(root, COVER.cell_name(number), random_cell(number), 0.0, 0)
+    root.attrs["version"] = 2
+    for reader in (base, Snapshot.open(place)):
+        assert (reader.version, reader.image_count(), reader.cell_numbers()) == ("v1", 3, ())
+    commit(session, 2, "batch 2")
+    assert (base.version, base.image_count(), len(base.images()), base.cell_numbers()) == ("v1", 3, 3, ())
+    after = Snapshot.open(place)
+    assert (after.version, after.image_count(), after.cell_numbers()) == ("v2", 5, (number,))
+
+
+def test_a_change_that_is_given_up_leaves_nothing(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    session, _ = begin_change(place)
+    append_table(group_of(zarr.open_group(session.store, mode="r+"), "images"), image_columns(2))
+    del session
+    assert Snapshot.open(place).image_count() == 0
+    assert [v.name for v in versions(place)] == ["v0"]
+    with pytest.raises(StoreError, match="nowhere: no such network"):
+        begin_change(str(tmp_path / "nowhere"))
+
+
+# Tags
+
+
+def with_versions(tmp_path: Path, last: int) -> str:
+    """A network of versions 0 to ``last``, each with one image more."""
+    place = new(tmp_path)
+    for number in range(1, last + 1):
+        write(place, number, lambda root, number=number: append_table(group_of(root, "images"), image_columns(1, number - 1)))
+    return place
+
+
+def test_tag_names_the_newest_version_or_the_one_that_is_named(tmp_path: Path) -> None:
+    place = with_versions(tmp_path, 2)
+    tagged = tag_version(place, "delivery")
+    assert (tagged.name, tagged.tags) == ("v2", ("delivery",))
+    assert tag_version(place, "Q3-2026_first.draft", "v1").name == "v1"
+    # by another tag
+    again = tag_version(place, "accepted", "delivery")
+    assert (again.name, sorted(again.tags)) == ("v2", ["accepted", "delivery"])
+    listed = versions(place)
+    assert [(v.name, v.tags) for v in listed] == [("v2", ("accepted", "delivery")), ("v1", ("Q3-2026_first.draft",)), ("v0", ())]
+    for name, number in (("delivery", 2), ("accepted", 2), ("v2", 2), ("Q3-2026_first.draft", 1), ("v1", 1), ("v0", 0)):
+        assert find_version(place, name) == listed[2 - number]
+        assert (Snapshot.open(place, name).number, Snapshot.open(place, name).image_count()) == (number, number)
+    # giving a tag makes no version
+    assert [v.number for v in listed] == [2, 1, 0]
+
+
+def test_tag_survives_what_comes_later(tmp_path: Path) -> None:
+    place = with_versions(tmp_path, 1)
+    number = COVER.cells_owned(1)[2]
+    cell = random_cell(number, seed=1)
+    write(place, 2, lambda root: write_cell(root, COVER.cell_name(number), cell, 0.0, 0))
+    tagged = tag_version(place, "delivery")
+
+    def clear(root: zarr.Group) -> None:
+        del group_of(root, "cells")[COVER.cell_name(number)]
+        append_table(group_of(root, "images"), image_columns(4, 1))
+
+    write(place, 3, clear)
+    write(place, 4, lambda root: write_cell(root, COVER.cell_name(number), random_cell(number, seed=2), 0.0, 0))
+    assert find_version(place, "delivery") == tagged
+    assert {v.name: v.tags for v in versions(place)} == {"v4": (), "v3": (), "v2": ("delivery",), "v1": (), "v0": ()}
+    snapshot = Snapshot.open(place, "delivery")
+    assert (snapshot.version, snapshot.image_count()) == ("v2", 1)
+    assert_same_cell(snapshot.cell(number), cell)
+    network = submin.open(place)
+    assert (network.version, network.at("delivery").version, network.at("delivery").at("v4").version) == ("v4", "v2", "v4")
+    assert Snapshot.open(place).image_count() == 5
+
+
+def test_tag_is_given_once(tmp_path: Path) -> None:
+    place = with_versions(tmp_path, 2)
+    tag_version(place, "delivery", "v1")
+    for version in ("v1", "v2", None):
+        with pytest.raises(StoreError, match="network: tag 'delivery' is that of v1; expected a new one: a tag is given once"):
+            tag_version(place, "delivery", version)
+    assert find_version(place, "delivery").name == "v1"
+    assert [v.tags for v in versions(place)] == [(), ("delivery",), ()]
+
+
+@pytest.mark.parametrize("tag", ["v3", "v0", "v12", "v007", "", "two words", "a/b", "../a", "größe", "tag\n", "a,b", "a:b"])
+def test_tag_that_is_no_word_or_hides_a_version_is_refused(tmp_path: Path, tag: str) -> None:
+    place = with_versions(tmp_path, 1)
+    with pytest.raises(StoreError, match=re.escape(f"tag is {tag!r}; expected a word of letters, digits, '.', '_' and '-'")):
+        tag_version(place, tag)
+    assert [v.tags for v in versions(place)] == [(), ()]
+
+
+@pytest.mark.parametrize("tag", ["v", "v3.1", "V3", "v3-final", "3", "v3v", "main", "-x", ".hidden"])
+def test_tag_that_only_resembles_a_version_is_a_tag(tmp_path: Path, tag: str) -> None:
+    place = with_versions(tmp_path, 1)
+    tag_version(place, tag, "v0")
+    assert find_version(place, tag).name == Snapshot.open(place, tag).version == "v0"
+    assert Snapshot.open(place).version == "v1"
+
+
+def test_unknown_version_is_named_with_the_tags_there_are(tmp_path: Path) -> None:
+    place = with_versions(tmp_path, 2)
+    tag_version(place, "delivery", "v1")
+    tag_version(place, "draft", "v0")
+    message = "version is 'nothing'; expected one of v0 to v2, delivery, draft .see 'submin history'"
+    for opening in (find_version, Snapshot.open, lambda place, name: tag_version(place, "other", name)):
+        with pytest.raises(QueryError, match=message):
+            opening(place, "nothing")
+    assert sorted(tag for v in versions(place) for tag in v.tags) == ["delivery", "draft"]
+    with pytest.raises(StoreError, match="nowhere: no such network"):
+        tag_version(str(tmp_path / "nowhere"), "delivery")
+
+
 # Content
 
 
@@ -237,7 +371,7 @@ def test_cell_comes_back(tmp_path: Path) -> None:
     place = new(tmp_path)
     number = COVER.cells_owned(1)[2]
     cell = random_cell(number)
-    write(place, 1, lambda root: write_cell(root, COVER.cell_name(number), cell, 3.5))
+    write(place, 1, lambda root: write_cell(root, COVER.cell_name(number), cell, 3.5, 9))
     snapshot = Snapshot.open(place)
     assert snapshot.cell_numbers() == (number,)
     found = snapshot.cell(number)
@@ -251,7 +385,8 @@ def test_cell_comes_back(tmp_path: Path) -> None:
     attributes = snapshot.cell_attributes(number)
     accepted = [int(cell.rays.accepted[cell.rays.point == j].sum()) for j in range(len(cell))]
     assert (attributes["points"], attributes["rays"], attributes["accepted"]) == (5, 15, sum(accepted))
-    assert (attributes["determined"], attributes["square_px"]) == (sum(count >= 2 for count in accepted), 3.5)
+    assert attributes["determined"] == sum(count >= 2 for count in accepted)
+    assert (attributes["square_px"], attributes["pixel_rays"]) == (3.5, 9)
     network = submin.open(place)
     images, sums = network.cell_sums(number)
     np.testing.assert_array_equal(images, cell.images)
@@ -260,12 +395,43 @@ def test_cell_comes_back(tmp_path: Path) -> None:
 
 def test_cell_is_replaced_whole_and_its_past_stays(tmp_path: Path) -> None:
     place = new(tmp_path)
-    name = COVER.cell_name(4)
-    old, later = random_cell(4, seed=1, points=6), random_cell(4, seed=2, points=2)
-    write(place, 1, lambda root: write_cell(root, name, old, 0.0))
-    write(place, 2, lambda root: write_cell(root, name, later, 0.0))
-    assert_same_cell(Snapshot.open(place).cell(4), later)
-    assert_same_cell(Snapshot.open(place, "v1").cell(4), old)
+    number = COVER.cells_owned(1)[2]
+    name = COVER.cell_name(number)
+    old, later = random_cell(number, seed=1, points=6), random_cell(number, seed=2, points=2)
+    write(place, 1, lambda root: write_cell(root, name, old, 0.0, 0))
+    write(place, 2, lambda root: write_cell(root, name, later, 0.0, 0))
+    assert_same_cell(Snapshot.open(place).cell(number), later)
+    assert_same_cell(Snapshot.open(place, "v1").cell(number), old)
+
+
+def test_finer_cover_finds_the_cells_that_it_has_in_common(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    finer = COVER.split(0)
+    (part, *_), same = finer.cells_owned(finer.quarters(0)[0]), COVER.cells_owned(COVER.rows * COVER.columns - 1)[-1]
+    assert 0 not in COVER.holders(same)
+    cells = [random_cell(same, seed=1), random_cell(part, seed=2)]
+
+    def refine(root: zarr.Group) -> None:
+        write_cell(root, finer.cell_name(part), cells[1], 0.0, 0)
+        write_sub_min(root, finer.tile_name(finer.quarters(0)[0]), sub_min(2), [part])
+        root.attrs.update(replace(METADATA, cover=finer.to_mapping()).to_attributes())
+
+    write(place, 1, lambda root: write_cell(root, COVER.cell_name(same), cells[0], 0.0, 0))
+    write(place, 2, refine)
+    assert (Snapshot.open(place, "v1").cover, Snapshot.open(place).cover) == (COVER, finer)
+    assert Snapshot.open(place, "v1").cell_numbers() == (same,)
+    snapshot = Snapshot.open(place)
+    assert snapshot.cell_numbers() == (same, part)
+    assert snapshot.tile_numbers() == (finer.quarters(0)[0],)
+    for cell in cells:
+        assert_same_cell(snapshot.cell(cell.number), cell)
+    # a change sees the version that it starts from with the tiles that it makes
+    base = Snapshot.open(place, "v1")
+    making = Snapshot(base.root, place, finer)
+    assert making.cover == finer and making.number == 1
+    assert making.cell_numbers() == (same,)
+    assert_same_cell(making.cell(same), cells[0])
+    assert len(making.cell(part)) == 0
 
 
 def sub_min(images: int, seed: int = 1) -> SubMin:
