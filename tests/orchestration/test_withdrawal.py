@@ -10,15 +10,17 @@ import pytest
 from networks import area_of, fuse, rewrite, same_network
 
 import submin
+from orchestration.control import add_control
 from orchestration.executors import SerialExecutor
 from orchestration.info import describe
 from orchestration.withdraw import withdraw
-from submin.errors import InputError
+from submin.errors import BusyError, InputError
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
-from submin.storage.catalogue_schema import Block
+from submin.storage.catalogue_schema import Block, PointTable
 from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot, versions
+from submin.storage.writer_lock import writing
 
 HERE = SerialExecutor()
 
@@ -133,6 +135,17 @@ def test_what_is_not_there_cannot_be_withdrawn(complete: Path, what: dict[str, s
     with pytest.raises(InputError, match=said):
         withdraw(str(complete), HERE, **what)  # type: ignore[arg-type]
     assert Snapshot.open(str(complete)).number == 1
+
+
+def test_nothing_is_withdrawn_or_added_while_another_writes(base: Path, blocks: list[Block], region: SimulatedRegion) -> None:
+    control = PointTable(region.point_ids[:1], region.truth[:1], np.eye(3)[None], np.array([""]))
+    with writing(str(base)):
+        with pytest.raises(BusyError, match="is writing to this network"):
+            withdraw(str(base), HERE, block=blocks[0].block_id)
+        with pytest.raises(BusyError, match="is writing to this network"):
+            add_control(control, "test", str(base), HERE)
+    assert Snapshot.open(str(base)).number == 1
+    assert withdraw(str(base), HERE, block=blocks[0].block_id).version == "v2"
 
 
 def test_twice_is_once(base: Path, blocks: list[Block]) -> None:
