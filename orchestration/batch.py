@@ -15,7 +15,7 @@ from orchestration.progress import Reporter
 from orchestration.tasks import BlockRays, FlaggedImage, adjust_blocks
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.network_image import NetworkImage
-from submin.network.registration import SAME_POINT_METRES, LooseRays, together
+from submin.network.registration import LooseRays, together
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_point_of
 from submin.storage.ledger import Entry, Ledger
@@ -66,9 +66,10 @@ def fuse_batch(
     """
     session, base = begin_change(where, version)
     refused = list(rejected)
-    blocks = _stage_one(blocks, base, executor, reporter, refused)
-    blocks, move = _register(blocks, base, refused)
-    if not blocks and Ledger.of(base).said((r.block_id, r.reason) for r in refused):
+    accepted = _stage_one(blocks, base, executor, reporter, refused)
+    blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, base, refused)
+    unsaid = [r for r in refused if not Ledger.of(base).said(r.block_id, r.reason)]
+    if not blocks and not unsaid:
         return BatchResult(base.number, (), tuple(refused), (), (), ())  # the same command again writes nothing
     settled = settle(session, base, move, executor, reporter)
     version += 1
@@ -79,7 +80,7 @@ def fuse_batch(
         Entry(b.block_id, b.content_hash(), "fused", "", version, len(b.images), len(b), n)
         for b, n in zip(blocks, rejected_rays, strict=True)
     ]  # fmt: skip
-    entries += [Entry(r.block_id, "", "rejected", r.reason, version) for r in refused]
+    entries += [Entry(r.block_id, "", "rejected", r.reason, version) for r in unsaid]
     records = [image for block in blocks for image in block.images]
     finish(session, base, move, settled, records, entries, f"{len(blocks)} blocks fused, {len(refused)} rejected")
     return BatchResult(
@@ -90,16 +91,20 @@ def fuse_batch(
 
 def _stage_one(
     blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected]
-) -> list[Block]:  # fmt: skip
-    """Adjust each block of images by itself; the blocks that succeed."""
+) -> dict[str, NDArray[np.bool_]]:
+    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of control points."""
     of_images = [block for block in blocks if control_point_of(block.block_id) is None]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
     arguments = [([_block_rays(b) for b in group], base.metadata.ellipsoid) for group in groups]
     handles = executor.submit_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
-    outcomes = [outcome for group in executor.results(handles) for outcome in group]
-    failed = {o.block_id: reason for o in outcomes if (reason := o.reason or _disagreement(o.accepted)) is not None}
-    refused.extend(Rejected(block.block_id, failed[block.block_id]) for block in blocks if block.block_id in failed)
-    return [block for block in blocks if block.block_id not in failed]
+    accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if control_point_of(b.block_id) is not None}
+    for outcome in (outcome for group in executor.results(handles) for outcome in group):
+        reason = outcome.reason or _disagreement(outcome.accepted)
+        if reason is None:
+            accepted[outcome.block_id] = outcome.accepted
+        else:
+            refused.append(Rejected(outcome.block_id, reason))
+    return accepted
 
 
 def _disagreement(accepted: NDArray[np.bool_]) -> str | None:
@@ -112,41 +117,39 @@ def _disagreement(accepted: NDArray[np.bool_]) -> str | None:
     )
 
 
-def _register(blocks: list[Block], base: Snapshot, refused: list[Rejected]) -> tuple[list[Block], Move]:
+def _register(
+    blocks: list[Block], accepted: dict[str, NDArray[np.bool_]], base: Snapshot, refused: list[Rejected]
+) -> tuple[list[Block], Move]:
     """Register the rays of the batch; a block that measures a known point elsewhere, or nothing inside the area, is rejected."""
     while True:
-        rays = _arriving(blocks, base.image_count())
+        rays = _arriving(blocks, accepted, base.image_count())
         move = place(
             base, take_points(base, np.unique(rays.point_ids)), rays, [image for block in blocks for image in _network_images(block)]
         )  # fmt: skip
         bad = _misplaced(blocks, rays, move)
         if not bad:
             return blocks, move
-        refused.extend(Rejected(blocks[k].block_id, reason) for k, reason in bad.items())
+        refused.extend(Rejected(blocks[k].block_id, bad[k]) for k in sorted(bad))
         blocks = [block for k, block in enumerate(blocks) if k not in bad]
 
 
-def _misplaced(blocks: Sequence[Block], rays: LooseRays, move: Move) -> dict[int, str]:
+def _misplaced(blocks: Sequence[Block], arriving: LooseRays, move: Move) -> dict[int, str]:
     """Blocks of the batch that cannot be registered, with the reason."""
-    bad: dict[int, str] = {}
-    # the arriving rays are the first of those that were registered
-    apart, outside = move.registration.apart[: len(rays)], move.registration.outside[: len(rays)]
-    inside = np.bincount(rays.block[~outside], minlength=len(blocks))
-    for empty in np.flatnonzero(inside == 0):
-        bad[int(empty)] = (
-            "the block lies wholly outside the area of the network; longitude and latitude look swapped, in the area or in its cameras"
-            if _inside_when_swapped(rays.point_ids[rays.block == empty], move)
-            else "the block lies wholly outside the area of the network; create a network whose area holds it"
-        )
-    far = np.flatnonzero(apart > SAME_POINT_METRES)
-    if len(far):
-        # two rays of one id that disagree: the later block is in error
-        worst = far[np.argmax(rays.block[far])]
-        k = int(rays.block[worst])
+    outside = move.registration.outside[: len(arriving)]  # the arriving rays are the first of those that were registered
+    inside = np.bincount(arriving.block[~outside], minlength=len(blocks))
+    bad = {
+        int(k): "the block lies wholly outside the area of the network; longitude and latitude look swapped, in the area or in its cameras"
+        if _inside_when_swapped(arriving.point_ids[arriving.block == k], move)
+        else "the block lies wholly outside the area of the network; create a network whose area holds it"
+        for k in np.flatnonzero(inside == 0)
+    }
+    for k, (point, metres) in move.contradictions.items():
         bad.setdefault(
             k,
-            f"point {rays.point_ids[worst]} is measured {apart[worst] / 1000.0:.1f} km from where other rays place it; "
-            "one id must be one place: use other point ids (imports prefix them unless --shared-ids)",
+            f"point {point} is measured {metres / 1000.0:.1f} km from where other rays place it; one id must be one place: "
+            "use other point ids (imports prefix them unless --shared-ids), or remove the ray if it is a gross blunder"
+            if np.isfinite(metres)
+            else f"point {point}: a camera does not reach the ground there; check the camera models and the axis order",
         )
     return bad
 
@@ -180,11 +183,12 @@ def _sigma(block: Block) -> NDArray[np.float64]:
     return np.column_stack([block.sigma_sample, block.sigma_line])
 
 
-def _arriving(blocks: Sequence[Block], first_image: int) -> LooseRays:
+def _arriving(blocks: Sequence[Block], accepted: dict[str, NDArray[np.bool_]], first_image: int) -> LooseRays:
     starts = first_image + np.cumsum([0, *(len(b.images) for b in blocks)])
     return together([
         LooseRays(
-            b.point_ids, (b.image + start).astype(np.int32), _observed(b), _sigma(b), np.full(len(b), k, dtype=np.int32)
+            b.point_ids, (b.image + start).astype(np.int32), _observed(b), _sigma(b), accepted[b.block_id],
+            np.full(len(b), k, dtype=np.int32),
         )
         for k, (b, start) in enumerate(zip(blocks, starts, strict=False))
     ])  # fmt: skip

@@ -18,7 +18,7 @@ from orchestration.executors import Executor
 from orchestration.progress import Reporter
 from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, report_of, update_tile
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.registration import LooseRays, Registration, register, taken_out, together
+from submin.network.registration import LooseRays, Registration, contradictions, register, taken_out, together
 from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
 from submin.storage.catalogue_schema import ImageRecord
 from submin.storage.ledger import Entry, append_entries
@@ -36,14 +36,17 @@ class TakenOut:
 
     Attributes
     ----------
-    rays : all their rays
+    rays : all rays that they keep; lost : number of those that they do not
     departures : ids of the points by cell
-    dissolved : names of cells that vanish with all their points, because the tiles that hold them were split
+    dissolved : names of cells that vanish with all their points, because a tile that held them was split
+    bereft : tiles that held such a cell and are still there
     """
 
     rays: LooseRays
     departures: dict[int, Ids]
-    dissolved: tuple[str, ...] = ()
+    lost: int = 0
+    dissolved: frozenset[str] = frozenset()
+    bereft: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -53,13 +56,15 @@ class Move:
     Attributes
     ----------
     cover : tiles of the new version
-    out : points taken out; registration : where they and the new ones go
+    out : points taken out; registration : where they and the arriving ones go, rays of these first
+    contradictions : blocks that measure a point elsewhere than what came before them, see `registration.contradictions`
     images : images that are new with this change, in the order of their rows
     """
 
     cover: Cover
     out: TakenOut
     registration: Registration
+    contradictions: dict[int, tuple[str, float]]
     images: tuple[NetworkImage, ...]
 
 
@@ -112,12 +117,13 @@ def take_points_seen(base: Snapshot, images: Index) -> TakenOut:
             rays.append(taken_out(cell, seen))
             departures[number] = cell.point_ids[seen]
     loose = together(rays)
-    return TakenOut(loose.take(~np.isin(loose.image, images)), departures)
+    stays = ~np.isin(loose.image, images)
+    return TakenOut(loose.take(stays), departures, int((~stays).sum()))
 
 
 def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequence[NetworkImage]) -> Move:
     """Register the points taken out with their remaining and arriving rays; split the tiles that would then hold too many images."""
-    cover = base.cover
+    cover, stored = base.cover, Stored.of(base)
     while True:
         rays = together([arriving, out.rays])
         first = base.image_count()
@@ -125,9 +131,9 @@ def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequen
         rows = np.concatenate([old, np.arange(first, first + len(new_images), dtype=np.int32)])
         images = image_set([*base.images(old), *new_images], base.metadata.ellipsoid, base.metadata.parameters)
         registration = register(rays, images, rows, cover)
-        full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(base, cover, tile, out, registration)]
+        full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(stored, cover, tile, out, registration)]
         if not full:
-            return Move(cover, out, registration, tuple(new_images))
+            return Move(cover, out, registration, contradictions(rays, registration, images, rows, cover), tuple(new_images))
         for tile in full:
             if tile not in cover.splits:  # not yet, as the larger neighbour of another one
                 cover = cover.split(tile)
@@ -135,25 +141,39 @@ def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequen
 
 
 def _touched_tiles(cover: Cover, out: TakenOut, registration: Registration) -> list[int]:
-    return sorted({tile for cell in {*registration.arrivals, *out.departures} for tile in cover.holders(cell)})
+    return sorted({*out.bereft, *(tile for cell in {*registration.arrivals, *out.departures} for tile in cover.holders(cell))})
 
 
-def _overfull(base: Snapshot, cover: Cover, tile: int, out: TakenOut, registration: Registration) -> bool:
+@dataclass(frozen=True)
+class Stored:
+    """What a version has, listed once: its tiles, and its cells by name."""
+
+    base: Snapshot
+    tiles: frozenset[int]
+    cells: dict[str, int]
+
+    @classmethod
+    def of(cls, base: Snapshot) -> Stored:
+        """Of a version."""
+        return cls(base, frozenset(base.tile_numbers()), {base.cover.cell_name(c): c for c in base.cell_numbers()})
+
+
+def _overfull(stored: Stored, cover: Cover, tile: int, out: TakenOut, registration: Registration) -> bool:
     """True when a tile would hold more image parameters than it may, and can be split."""
     if not cover.can_split(tile):
         return False
+    base = stored.base
     limit = base.metadata.max_parameters // base.metadata.parameters
     arriving = {c: registration.arrivals[c].image for c in cover.cells_held(tile) if c in registration.arrivals}
     seen = [np.empty(0, dtype=np.int32), *arriving.values()]
-    if tile in base.tile_numbers():
+    if tile in stored.tiles:
         at_most = len(np.unique(np.concatenate([*seen, base.tile_images(tile)])))
         if at_most <= limit:
             return False
-    stored = {base.cover.cell_name(c): c for c in base.cell_numbers()}
     for number in cover.cells_held(tile):
         name = cover.cell_name(number)
-        if name in stored and name not in out.dissolved:
-            cell = base.cell(stored[name], with_sums=False)
+        if name in stored.cells and name not in out.dissolved:
+            cell = base.cell(stored.cells[name], with_sums=False)
             gone = np.isin(cell.point_ids, out.departures.get(number, np.empty(0, dtype="U1")))
             seen.append(cell.images[np.unique(cell.rays.image[~gone[cell.rays.point]])])
     return len(np.unique(np.concatenate(seen))) > limit
@@ -162,7 +182,7 @@ def _overfull(base: Snapshot, cover: Cover, tile: int, out: TakenOut, registrati
 def _dissolve(base: Snapshot, cover: Cover, out: TakenOut) -> TakenOut:
     """Take out all points of the cells that are none of a refined cover; they are named by tiles that are split now."""
     split = {*cover.splits} - {*base.cover.splits}
-    rays, departures, dissolved = [], dict(out.departures), set(out.dissolved)
+    rays, departures, dissolved, bereft = [], dict(out.departures), set(out.dissolved), set(out.bereft)
     taken = np.unique(out.rays.point_ids)
     for number in base.cell_numbers():
         name = base.cover.cell_name(number)
@@ -171,7 +191,8 @@ def _dissolve(base: Snapshot, cover: Cover, out: TakenOut) -> TakenOut:
             gone = np.isin(cell.point_ids, departures.pop(number, np.empty(0, dtype="U1"))) | np.isin(cell.point_ids, taken)
             rays.append(taken_out(cell, ~gone))
             dissolved.add(name)
-    return TakenOut(together([out.rays, *rays]), departures, tuple(sorted(dissolved)))
+            bereft.update(base.cover.holders(number))
+    return TakenOut(together([out.rays, *rays]), departures, out.lost, frozenset(dissolved), frozenset(bereft - {*cover.splits}))
 
 
 def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Executor, reporter: Reporter) -> Settled:
@@ -199,7 +220,7 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     released = sorted({row for _, row in flags})
     reconsidered = {*released} ^ {row for _, row in before}
     changed = {cell for report in reports for cell in report.changed}
-    again = {tile for cell in changed for tile in move.cover.holders(cell)} | _tiles_that_see(base, reconsidered)
+    again = {tile for cell in changed for tile in move.cover.holders(cell)} | _tiles_that_see(base, reconsidered) | move.out.bereft
     to_factor = []
     for tile in sorted(again - split):
         sources = sorted({Cover.owner(c) for c in move.cover.cells_held(tile)} & set(by_tile))
@@ -209,7 +230,7 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     if reports or factored:
         session.merge(*(report.writes for report in reports), *(done.writes for done in factored))
     gone = [f"cells/{move.cover.cell_name(c)}" for report in reports for c, cell in report.cells.items() if not len(cell.images)]
-    gone += [f"cells/{name}" for name in move.out.dissolved]
+    gone += [f"cells/{name}" for name in sorted(move.out.dissolved)]
     gone += [f"tiles/{move.cover.tile_name(t.tile)}" for t in factored if not t.images]
     gone += [f"tiles/{base.cover.tile_name(t)}" for t in split if t not in base.cover.splits]
     used, rejected = _ray_counts((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))

@@ -49,4 +49,4 @@ def add_control(points: PointTable, source: str, where: str, executor: Executor,
     blocks = control_blocks(points, Snapshot.open(where).metadata.ellipsoid, source)
     tally = fuse_blocks(blocks, where, executor, max(len(points), 1), reporter)
     rejected = tuple(RejectedPoint(control_point_of(r.block_id) or r.block_id, r.reason) for r in tally.rejected)
-    return ControlAdded(Snapshot.open(where).version, tally.control, len(points) - tally.control - len(rejected), rejected)
+    return ControlAdded(f"v{tally.version}", tally.control, len(points) - tally.control - len(rejected), rejected)

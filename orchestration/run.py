@@ -69,8 +69,10 @@ class RunResult:
 
 @dataclass
 class Tally:
-    """What has become of the blocks so far."""
+    """What has become of the blocks so far: ``version`` is the last one known, ``released`` the bad cameras that were known before."""
 
+    version: int
+    released: set[int]
     rejected: list[Rejected] = field(default_factory=list)
     flagged: dict[int, FlaggedImage] = field(default_factory=dict)
     unsettled: set[int] = field(default_factory=set)
@@ -80,6 +82,7 @@ class Tally:
 
     def add(self, batch: BatchResult) -> None:
         """Count a batch."""
+        self.version = batch.version
         self.rejected.extend(batch.rejected)
         self.flagged.update({f.row: f for f in batch.flagged})
         self.unsettled = (self.unsettled - set(batch.tiles)) | set(batch.unsettled)
@@ -101,8 +104,7 @@ def run(
         When another process is writing to the network.
     """
     started, reporter = time.monotonic(), reporter or Silent()
-    snapshot = Snapshot.open(place)
-    check_frames(catalogue, snapshot)
+    check_frames(catalogue, Snapshot.open(place))
     summary = catalogue.validate()
     control = catalogue.points("control")
     reporter.begin(summary.blocks + (0 if control is None else len(control)))
@@ -110,7 +112,7 @@ def run(
         catalogue.blocks(), () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
     )
     tally = fuse_blocks(every, place, executor, batch_blocks, reporter)
-    return _result(Snapshot.open(place), snapshot, tally, started, executor)
+    return _result(Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
 
 
 def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> Tally:
@@ -123,22 +125,20 @@ def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_b
     ConflictError
         When one has written to it since the ledger was read, where there is no lock to keep it out.
     """
-    tally = Tally()
     with writing(place):
         known = Snapshot.open(place)
-        version, new = known.number, _new_blocks(blocks, Ledger.of(known), tally, reporter)
+        tally = Tally(known.number, {row for _, row in known.flags()})
+        new = _new_blocks(blocks, Ledger.of(known), tally, reporter)
         while batch := list(islice(new, max(batch_blocks, 1))):
             good = [block for block, reason in batch if reason is None]
             refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-            done = fuse_batch(place, version, good, refused, executor, reporter)
-            version = done.version
-            tally.add(done)
+            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter))
             reporter.fused(len(batch))
     return tally
 
 
-def _result(after: Snapshot, before: Snapshot, tally: Tally, started: float, executor: Executor) -> RunResult:
-    released = {row for _, row in after.flags()} - {row for _, row in before.flags()}
+def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -> RunResult:
+    released = {row for _, row in after.flags()} - tally.released
     cells = [after.cell_attributes(number) for number in after.cell_numbers()]
     used, in_pixels = (sum(cell[name] for cell in cells) for name in ("accepted", "pixel_rays"))
     square = sum(cell["square_px"] for cell in cells)

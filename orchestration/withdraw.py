@@ -13,6 +13,7 @@ from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from submin.errors import InputError
 from submin.network.registration import together
+from submin.storage.catalogue_schema import CONTROL_PREFIX
 from submin.storage.control_blocks import control_block_id
 from submin.storage.ledger import Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
@@ -85,6 +86,8 @@ def _leaving(base: Snapshot, kind: str, name: str) -> _Leaving:
     block_id = ledger.block_of_image.get(name, "") if kind == "image" else control_block_id(name) if kind == "control point" else name
     of_block = np.flatnonzero((table["withdrawn"] == 0) & (table["block_id"] == block_id))
     rows = of_block[table["image_id"][of_block] == name] if kind == "image" else of_block
+    if kind == "image" and name.startswith(CONTROL_PREFIX):
+        raise InputError(f"image {name!r} is a view of a control point; withdraw the point with --control")
     if not len(rows):
         raise InputError(
             f"{base.place}: {kind} {name!r} is not in the network; see 'submin info', or 'submin history' for what came and went"
@@ -95,23 +98,14 @@ def _leaving(base: Snapshot, kind: str, name: str) -> _Leaving:
 def _withdraw(where: str, version: int, leaving: _Leaving, executor: Executor, reporter: Reporter) -> Withdrawn:
     session, base = begin_change(where, version)
     rows, before, what = leaving.rows, leaving.before, f"{leaving.kind} {leaving.name}"
-    move = place(base, take_points_seen(base, rows.astype(np.int32)), together([]), [])
+    out = take_points_seen(base, rows.astype(np.int32))
+    move = place(base, out, together([]), [])
     settled = settle(session, base, move, executor, reporter)
-    rays = before.rays if leaving.whole_block else _rays_of(base, rows)
-    left = replace(before, version=version + 1, images=before.images - len(rows), rays=before.rays - rays)
+    left = replace(before, version=version + 1, images=before.images - len(rows), rays=before.rays - out.lost)
     if leaving.whole_block:
         entry = replace(left, status="withdrawn", reason=f"{leaving.kind} withdrawn", rays_rejected=0)
     else:
-        entry = replace(left, reason=f"without image {leaving.name}")
+        entry = replace(left, reason=", ".join([before.reason or "without image", leaving.name]).replace("image, ", "image "))
     finish(session, base, move, settled, [], [entry], f"{what} withdrawn", withdrawn=rows.tolist())
     tiles = tuple(move.cover.tile_name(report.tile) for report in settled.reports)
-    return Withdrawn(f"v{version + 1}", what, len(rows), rays, tiles)
-
-
-def _rays_of(base: Snapshot, rows: NDArray[np.int64]) -> int:
-    """Rays of some images."""
-    total = 0
-    for number in base.cell_numbers():
-        cell = base.cell(number, with_sums=False)
-        total += int(np.isin(cell.images[cell.rays.image], rows).sum())
-    return total
+    return Withdrawn(f"v{version + 1}", what, 0 if leaving.kind == "control point" else len(rows), out.lost, tiles)

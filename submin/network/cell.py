@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import LinearRays, PointFactors, Sums, eliminate, linearise, point_factors
+from submin.adjustment.estimation import fill_symmetric
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays, sorted_rays
 
@@ -134,9 +135,22 @@ def linear_rays(cell: Cell, images: ImageSet, points: NDArray[np.int64] | None =
 
 
 def summed(cell: Cell, images: ImageSet) -> Cell:
-    """The cell with sums made anew from its accepted rays at its linearisation."""
-    linear = linear_rays(cell, images)
-    return replace(cell, sums=eliminate(linear, cell.rays.accepted.astype(np.float64), len(cell.images)))
+    """The cell with sums made anew from its accepted rays at its linearisation, in the order of the images' ids."""
+    by_id = np.argsort(np.array(images.ids, dtype=np.str_))
+    rank = np.argsort(by_id).astype(np.int32)
+    rays = sorted_rays(cell.rays.point, rank[cell.rays.image], cell.rays.observed, cell.rays.sigma, cell.rays.accepted)
+    linear = linearise(images.take(by_id), rays, cell.theta[by_id], cell.linearised_at, cell.origin)
+    sums = eliminate(linear, rays.accepted.astype(np.float64), len(images))
+    return replace(cell, sums=reordered(sums, rank, images.parameters))
+
+
+def reordered(sums: Sums, order: Index | NDArray[np.int64], parameters: int) -> Sums:
+    """Sums about the same images in another order: image k of the result is image ``order[k]``."""
+    rows = (np.asarray(order, dtype=np.int64)[:, None] * parameters + np.arange(parameters)).ravel()
+    if np.array_equal(rows, np.arange(len(rows))):
+        return sums
+    full = fill_symmetric(sums.information.copy())
+    return Sums(np.tril(full[np.ix_(rows, rows)]), sums.vector[rows], sums.misclosure, sums.redundancy)
 
 
 def factors(cell: Cell, images: ImageSet, points: NDArray[np.int64]) -> tuple[LinearRays, PointFactors]:

@@ -7,7 +7,7 @@ order of their ids: where a point is registered depends on its rays alone, not o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ class LooseRays:
     ----------
     point_ids : (r,) ids of the points; image : (r,) row of the network's images
     observed, sigma : (r, 2)
+    accepted : (r,) as last judged: by stage 1, or in the cell
     block : (r,) number of each ray's block within its batch; `IN_THE_NETWORK` for a ray taken out of a cell
     """
 
@@ -44,6 +45,7 @@ class LooseRays:
     image: NDArray[np.int32]
     observed: Array
     sigma: Array
+    accepted: Flags
     block: NDArray[np.int32]
 
     def __len__(self) -> int:
@@ -51,22 +53,24 @@ class LooseRays:
 
     def take(self, rows: Flags) -> LooseRays:
         """The rays where ``rows`` (r,) is True."""
-        return LooseRays(self.point_ids[rows], self.image[rows], self.observed[rows], self.sigma[rows], self.block[rows])
+        return LooseRays(*(getattr(self, name)[rows] for name in _NAMES))
+
+
+_NAMES = tuple(field.name for field in fields(LooseRays))
 
 
 def together(parts: Sequence[LooseRays]) -> LooseRays:
     """All rays of some parts."""
     none = np.empty(0, dtype=np.int32)
-    empty = LooseRays(np.empty(0, dtype="U1"), none, np.empty((0, 2)), np.empty((0, 2)), none)
-    names = ("point_ids", "image", "observed", "sigma", "block")
-    return LooseRays(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in names))
+    empty = LooseRays(np.empty(0, dtype="U1"), none, np.empty((0, 2)), np.empty((0, 2)), none.astype(np.bool_), none)
+    return LooseRays(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in _NAMES))
 
 
 def taken_out(cell: Cell, points: Flags) -> LooseRays:
     """The rays of those of a cell's points where ``points`` (n,) is True."""
     rays = cell.rays.take(points[cell.rays.point])
     block = np.full(len(rays), IN_THE_NETWORK, dtype=np.int32)
-    return LooseRays(cell.point_ids[rays.point], cell.images[rays.image], rays.observed, rays.sigma, block)
+    return LooseRays(cell.point_ids[rays.point], cell.images[rays.image], rays.observed, rays.sigma, rays.accepted, block)
 
 
 @dataclass(frozen=True)
@@ -77,13 +81,13 @@ class Registration:
     ----------
     arrivals : points by cell, with all of their rays
     directory : ids and cells of all points
-    apart : (r,) metres between the places to which the rays of the ray's point point; infinite where a camera reaches no ground
+    passing : (r, 3) metres by which each ray passes the place of its point, and on which side; infinite where a camera reaches no ground
     outside : (r,) True for rays on points outside the cover's rectangle
     """
 
     arrivals: dict[int, RegisteredPoints]
     directory: tuple[Ids, NDArray[np.int64]]
-    apart: Array
+    passing: Array
     outside: Flags
 
 
@@ -94,7 +98,7 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     """
     ids, point = np.unique(rays.point_ids, return_inverse=True)
     if not len(rays):
-        return Registration({}, (ids, np.empty(0, dtype=np.int64)), np.empty(0), np.empty(0, dtype=np.bool_))
+        return Registration({}, (ids, np.empty(0, dtype=np.int64)), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
     named = np.argsort(np.array(images.ids, dtype=np.str_))
     rank = np.empty(len(named), dtype=np.int32)
     rank[named] = np.arange(len(named))
@@ -110,9 +114,9 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     at[reached] = cover.cells_of(geodetic[:, 0], geodetic[:, 1])
     outside[reached] = cover.outside(geodetic[:, 0], geodetic[:, 1])
     usable, compact = reached[point], np.cumsum(reached) - 1
-    apart = np.full(len(ids), np.inf)
+    passing = np.full((len(point), 3), np.inf)
     if usable.any():
-        apart[reached] = _apart(images, local[usable], rays.observed[usable], compact[point[usable]], origin[reached])
+        passing[usable] = _passing(images, local[usable], rays.observed[usable], compact[point[usable]], origin[reached])
 
     arrivals: dict[int, RegisteredPoints] = {}
     order = np.lexsort((np.arange(len(point)), at[point]))  # rays by cell: one pass however many cells
@@ -123,18 +127,51 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
             arrivals[number] = RegisteredPoints(
                 ids[members], origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
             )
-    return Registration(arrivals, (ids, at), apart[point], outside[point])
+    return Registration(arrivals, (ids, at), passing, outside[point])
 
 
-def _apart(images: ImageSet, image: NDArray[np.int32], observed: Array, point: NDArray[np.int64], origin: Array) -> Array:
-    """Metres (n,) between the places to which the rays of each point point: how far they pass it, each in its own plane, on which sides."""
+def _passing(images: ImageSet, image: NDArray[np.int32], observed: Array, point: NDArray[np.int64], origin: Array) -> Array:
+    """Metres (r, 3) by which rays pass their points, each in the plane across it."""
     theta = np.zeros((len(images), images.parameters))
     projection = images.project(theta, images.ground(origin), image, point.astype(np.int32))
     b = projection.by_ground
     square = b @ np.swapaxes(b, 1, 2)
     square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(2)  # a view along one axis only has an empty row
-    passing = np.einsum("rck,rc->rk", b, np.linalg.solve(square, (observed - projection.image)[:, :, None])[:, :, 0])
+    return np.asarray(np.einsum("rck,rc->rk", b, np.linalg.solve(square, (observed - projection.image)[:, :, None])[:, :, 0]))
+
+
+def contradictions(
+    rays: LooseRays, registration: Registration, images: ImageSet, image_rows: NDArray[np.int32], cover: Cover
+) -> dict[int, tuple[str, float]]:
+    """Blocks of a batch that measure a point elsewhere than the network or the blocks before them, with the point and how far off, metres.
+
+    Blocks are taken in their order, and one that contradicts is left out for those after it: the same as one at a time. Only rays count
+    that were accepted when last judged: a blunder that stage 1 has found is no second place. Arguments as of `register`, and its result.
+    """
+    counts = rays.accepted | ~np.isfinite(registration.passing).all(axis=1)
+    far, apart = _apart(rays.point_ids[counts], registration.passing[counts])
+    doubtful = rays.take(counts & np.isin(rays.point_ids, far[apart > SAME_POINT_METRES]))
+    kept = doubtful.block == IN_THE_NETWORK
+    found: dict[int, tuple[str, float]] = {}
+    for block in np.unique(doubtful.block[~kept]).tolist():
+        mine = doubtful.block == block
+        together_now = doubtful.take((kept | mine) & np.isin(doubtful.point_ids, doubtful.point_ids[mine]))
+        points, apart = _apart(together_now.point_ids, register(together_now, images, image_rows, cover).passing)
+        worst = int(np.argmax(apart))
+        if apart[worst] > SAME_POINT_METRES:
+            found[block] = (str(points[worst]), float(apart[worst]))
+        else:
+            kept |= mine
+    return found
+
+
+def _apart(point_ids: Ids, passing: Array) -> tuple[Ids, Array]:
+    """Points, and the metres (n,) between the places to which the rays of each point; infinite where a camera reaches no ground."""
+    points, point = np.unique(point_ids, return_inverse=True)
+    if not len(points):
+        return points, np.empty(0)
     order = np.argsort(point, kind="stable")
-    first = np.searchsorted(point[order], np.arange(len(origin)))
-    widest = np.maximum.reduceat(passing[order], first, axis=0) - np.minimum.reduceat(passing[order], first, axis=0)
-    return np.asarray(np.linalg.norm(widest, axis=1))
+    first = np.searchsorted(point[order], np.arange(len(points)))
+    high, low = np.maximum.reduceat(passing[order], first, axis=0), np.minimum.reduceat(passing[order], first, axis=0)
+    with np.errstate(invalid="ignore"):
+        return points, np.linalg.norm(np.where(np.isfinite(high), high - low, np.inf), axis=1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from submin.adjustment.elimination import LinearRays, PointFactors, Sums, ground_corrections
 from submin.adjustment.estimation import estimate_images, fill_symmetric
 from submin.adjustment.images import ImageSet
-from submin.network.cell import empty_sums
+from submin.network.cell import empty_sums, reordered
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -91,8 +91,15 @@ def factor(sums: Sums, rows: Index, images: ImageSet) -> SubMin:
     NumericalError
         When the information is not positive definite.
     """
-    estimate = estimate_images(sums, images.prior, images.parameters)
-    return SubMin(rows, estimate.theta, estimate.covariance, estimate.chi_square, sums.redundancy)
+    # in the order of the ids: the rows tell when an image came, which must leave no trace
+    by_id = np.argsort(np.array(images.ids, dtype=np.str_))
+    rank, p = np.argsort(by_id), images.parameters
+    estimate = estimate_images(reordered(sums, by_id, p), images.take(by_id).prior, p)
+    covariance = estimate.covariance
+    if not np.array_equal(rank, np.arange(len(rank))):
+        at = (rank[:, None] * p + np.arange(p)).ravel()
+        covariance = covariance[np.ix_(at, at)]
+    return SubMin(rows, estimate.theta[rank], covariance, estimate.chi_square, sums.redundancy)
 
 
 def locate(part: GroundPart, sub_min: SubMin) -> Array:

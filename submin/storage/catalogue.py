@@ -216,8 +216,8 @@ class Catalogue:
             number_values(table, "line"),
             number_values(table, "sigma_sample", DEFAULT_SIGMA_PX),
             number_values(table, "sigma_line", DEFAULT_SIGMA_PX),
-            path.name,
-            row,
+            source=path.name,
+            first_row=row,
         )
 
 

@@ -58,4 +58,6 @@ def _blocks(points: PointTable, ellipsoid: Ellipsoid) -> Iterator[Block]:
         yield Block(
             block_id, images, None, np.array([point_id, point_id]), np.arange(2, dtype=np.int32),
             np.zeros(2), np.zeros(2), sigmas[:, 0], sigmas[:, 1],
+            # as surveyed: eigenvectors differ in their last digits, or altogether, from one machine to another
+            content=json.dumps([point_id, points.geodetic[k].tolist(), points.covariance_enu[k].tolist()]),
         )  # fmt: skip

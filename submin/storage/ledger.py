@@ -102,9 +102,9 @@ class Ledger:
         self._content[block.block_id] = block.content_hash()
         self.block_of_image.update((image.image_id, block.block_id) for image in block.images)
 
-    def said(self, refused: Iterable[tuple[str, str]]) -> bool:
-        """True when the last line of each of these blocks is a rejection for the same reason."""
-        return all(self.rejections.get(block_id) == reason for block_id, reason in refused)
+    def said(self, block_id: str, reason: str) -> bool:
+        """True when the last line of a block is a rejection for the same reason."""
+        return self.rejections.get(block_id) == reason
 
     def fused(self) -> tuple[Entry, ...]:
         """Blocks of images that are in the network."""

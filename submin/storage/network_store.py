@@ -132,11 +132,14 @@ def versions(place: str) -> list[Version]:
     tags: dict[str, list[str]] = {}
     for tag in sorted(repository.list_tags()):
         tags.setdefault(repository.lookup_tag(tag), []).append(tag)
-    return [
+    found = [
         Version(int(a.metadata["version"]), a.id, a.written_at, a.message, tuple(tags.get(a.id, ())))
         for a in repository.ancestry(branch=BRANCH)
         if "version" in a.metadata
     ]
+    if not found:
+        raise StoreError(f"{place}: holds a repository but no network; make one with 'submin create'")
+    return found
 
 
 def find_version(place: str, name: str) -> Version:

@@ -10,7 +10,10 @@ import pytest
 from networks import accepted_rays, area_of, by_image, fuse, rewrite, same_network
 
 import submin
-from orchestration.executors import executor_for
+from orchestration.create import create
+from orchestration.executors import SerialExecutor, executor_for
+from orchestration.progress import Silent
+from orchestration.run import run
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.network_store import Snapshot, versions
@@ -110,3 +113,72 @@ def test_readers_keep_their_version(region: SimulatedRegion, catalogue: Path, tm
     assert np.array_equal(before.covariance, after.covariance)
     assert submin.open(network).version == "v2"
     assert np.array_equal(submin.open(network).at("v1").query(bbox=(90, 30, 110, 40), policy="rigorous").covariance, before.covariance)
+
+
+@pytest.mark.parametrize("batch_blocks", [1, 500])
+def test_the_block_in_error_is_rejected_and_none_that_comes_after_it(
+    region: SimulatedRegion, catalogue: Path, tmp_path: Path, batch_blocks: int
+) -> None:
+    """A good block, one that has a point of it elsewhere, and a good one that measures this point too."""
+    blocks = list(Catalogue.open(catalogue).blocks())
+    first, second = next((a, b) for a in blocks for b in blocks if a is not b and len(set(a.point_ids) & set(b.point_ids)) > 5)
+    stranger = next(b for b in blocks if not set(b.point_ids) & set(first.point_ids))
+    shared = sorted(set(first.point_ids) & set(second.point_ids))[0]
+    ids = np.array([shared if p == stranger.point_ids[0] else str(p) for p in stranger.point_ids], dtype=np.str_)
+    bad = dataclasses.replace(stranger, point_ids=ids)
+    network = tmp_path / "network"
+    mixed = rewrite(catalogue, tmp_path / "mixed", [first, bad, second])
+    result = fuse(mixed, network, area_of(region), batch_blocks=batch_blocks)
+    assert [r.block_id for r in result.rejected] == [stranger.block_id]
+    assert f"point {shared} is measured" in result.rejected[0].reason
+    version = Snapshot.open(str(network)).number
+    again = fuse(mixed, network, area_of(region), batch_blocks=batch_blocks)
+    assert (again.fused, again.skipped, again.rejected) == (0, 2, result.rejected)
+    assert Snapshot.open(str(network)).number == version
+
+
+def test_a_blunder_of_kilometres_costs_its_ray_and_not_its_block(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
+    blocks = list(Catalogue.open(catalogue).blocks())
+    counts = {p: int((blocks[4].point_ids == p).sum()) for p in set(blocks[4].point_ids.tolist())}
+    k = next(k for k, p in enumerate(blocks[4].point_ids) if counts[str(p)] == 3)
+    sample = blocks[4].sample.copy()
+    sample[k] += 1500.0  # three kilometres
+    blocks[4] = dataclasses.replace(blocks[4], sample=sample)
+    result = fuse(rewrite(catalogue, tmp_path / "catalogue", blocks), tmp_path / "network", area_of(region))
+    assert (result.fused, result.rejected) == (12, ())
+    image = blocks[4].images[blocks[4].image[k]].image_id
+    assert accepted_rays(tmp_path / "network")[str(blocks[4].point_ids[k]), image] is False
+
+
+def test_a_rejection_is_entered_once_whatever_comes_with_it(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
+    blocks = list(Catalogue.open(catalogue).blocks())
+    line = blocks[0].line.copy()
+    line[0] = np.nan
+    bad = dataclasses.replace(blocks[0], line=line)
+    for count in (3, 5):
+        fuse(rewrite(catalogue, tmp_path / f"catalogue-{count}", [bad, *blocks[1:count]]), tmp_path / "network", area_of(region))
+    status = Snapshot.open(str(tmp_path / "network")).ledger(["status"])["status"].tolist()
+    assert (status.count("rejected"), status.count("fused")) == (1, 4)
+
+
+class AnotherRun(Silent):
+    """Runs another catalogue to its end while this run has looked at the network, and not yet locked it."""
+
+    def __init__(self, catalogue: Path, network: Path) -> None:
+        self.catalogue, self.network = catalogue, network
+
+    def begin(self, blocks: int) -> None:
+        run(Catalogue.open(self.catalogue), str(self.network), SerialExecutor())
+
+
+def test_a_run_that_ends_between_look_and_lock_counts_once_and_is_not_ours(
+    region: SimulatedRegion, catalogue: Path, complete: Path, tmp_path: Path
+) -> None:
+    (bad,) = region.bad_cameras
+    blocks = list(Catalogue.open(catalogue).blocks())
+    ours = [block for block in blocks if block.block_id != bad.rsplit("-", 1)[0]][:3]
+    some, network = rewrite(catalogue, tmp_path / "some", ours), tmp_path / "network"
+    create(str(network), area_of(region), Catalogue.open(catalogue).metadata, 60.0, 20.0)
+    result = run(Catalogue.open(some), str(network), SerialExecutor(), reporter=AnotherRun(catalogue, network))
+    assert (result.fused, result.skipped, result.flagged, result.version) == (0, 3, (), "v1")
+    same_network(network, complete)

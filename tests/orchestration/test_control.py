@@ -16,14 +16,16 @@ from orchestration.executors import SerialExecutor
 from orchestration.run import run
 from orchestration.withdraw import withdraw
 from submin.errors import InputError
-from submin.geodesy import geodetic_to_geocentric, local_axes
+from submin.geodesy import WGS84, Ellipsoid, geodetic_to_geocentric, local_axes
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
+from submin.storage.control_blocks import control_blocks
 from submin.storage.network_store import Snapshot
 
 HERE = SerialExecutor()
+MOON = Ellipsoid(1737400.0, 0.0)
 EVERYWHERE = (90.0, 30.0, 110.0, 40.0)
 
 
@@ -96,9 +98,24 @@ def test_withdrawn_control_was_never_there(complete: Path, base: Path, control: 
     add_control(control, "test", str(base), HERE)
     for point_id in control.point_ids:
         done = withdraw(str(base), HERE, control=str(point_id))
-        assert done.images == done.rays == 2
+        assert (done.images, done.rays) == (0, 2)
     same_network(base, complete)
     assert add_control(control, "test", str(base), HERE).fused == 6  # it can come again
+
+
+def test_one_view_of_a_control_point_cannot_be_withdrawn(base: Path, control: PointTable) -> None:
+    add_control(control, "test", str(base), HERE)
+    with pytest.raises(InputError, match="is a view of a control point; withdraw the point with --control"):
+        withdraw(str(base), HERE, image=f"control:{control.point_ids[0]}:0")
+
+
+def test_a_control_point_is_known_by_what_was_surveyed(control: PointTable) -> None:
+    """Not by eigenvectors, of which another machine may find others."""
+    (one, *_), (other, *_) = (list(control_blocks(control, ellipsoid, "test")) for ellipsoid in (WGS84, MOON))
+    assert one.images != other.images
+    assert one.content_hash() == other.content_hash()
+    moved = PointTable(control.point_ids, control.geodetic + 1e-9, control.covariance_enu, control.area)
+    assert next(iter(control_blocks(moved, WGS84, "test"))).content_hash() != one.content_hash()
 
 
 def test_control_counts_once(base: Path, region: SimulatedRegion, control: PointTable) -> None:

@@ -15,6 +15,7 @@ from orchestration.executors import SerialExecutor, executor_for
 from orchestration.info import describe
 from orchestration.run import run
 from orchestration.withdraw import withdraw
+from submin.geodesy import geocentric_to_geodetic
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
@@ -159,3 +160,63 @@ def test_an_image_that_enters_a_tile_through_a_pending_ray_counts_once(region: S
             assert snapshot.sub_min(tile).redundancy == 0  # held, and nothing known of it here
     run(Catalogue.open(rewrite(catalogue, tmp_path / "all", [*others, scout])), str(tmp_path / "at-once"), HERE)
     same_network(tmp_path / "at-once", network)
+
+
+def of_points(block: Block, images: list[int], points: set[str], name: str) -> Block:
+    """Some images of a block, with their rays on some points."""
+    rays = np.isin(block.image, images) & np.isin(block.point_ids, sorted(points))
+    return Block(
+        name, tuple(dataclasses.replace(block.images[k], block_id=name) for k in images), block.a_priori, block.point_ids[rays],
+        np.searchsorted(images, block.image[rays]).astype(np.int32), block.sample[rays], block.line[rays],
+        block.sigma_sample[rays], block.sigma_line[rays],
+    )  # fmt: skip
+
+
+def registered(network: Path) -> dict[str, tuple[float, float]]:
+    """Easting and northing at which each point of a network is registered."""
+    snapshot, at = Snapshot.open(str(network)), {}
+    for number in snapshot.cell_numbers():
+        cell = snapshot.cell(number)
+        geodetic = geocentric_to_geodetic(cell.origin, snapshot.metadata.ellipsoid)
+        east, north = snapshot.cover.plane(geodetic[:, 0], geodetic[:, 1])
+        at.update({str(p): (float(x), float(y)) for p, x, y in zip(cell.point_ids, east, north, strict=True)})
+    return at
+
+
+def test_a_tile_that_loses_its_last_shared_point_in_a_split_is_judged_again(
+    region: SimulatedRegion, catalogue: Path, tmp_path: Path
+) -> None:
+    """The only point that tiles A and B share moves out of A with its third ray, in the batch that splits B."""
+    block = list(Catalogue.open(catalogue).blocks())[6]
+    seen = [set(block.point_ids[block.image == k].tolist()) for k in range(3)]
+    every = seen[0] & seen[1] & seen[2]
+    at = []
+    for name, images in (("two", [0, 1]), ("three", [0, 1, 2])):
+        empty(region, catalogue, tmp_path / name, 10**6)
+        one = rewrite(catalogue, tmp_path / f"{name}-images", [of_points(block, images, every, name)])
+        run(Catalogue.open(one), str(tmp_path / name), HERE)
+        at.append(registered(tmp_path / name))
+    two, three = at
+    mover = next(
+        p for p in sorted(every, key=lambda p: two[p][0] - three[p][0])
+        if sum(three[q][0] > three[p][0] + 500.0 for q in every) >= 8 and sum(three[q][0] < three[p][0] - 21e3 for q in every) >= 2
+    )  # fmt: skip
+    assert three[mover][0] > two[mover][0]
+    edge = 0.5 * (two[mover][0] + three[mover][0])  # of tile A, half an overlap east of the border
+    metadata = Snapshot.open(str(tmp_path / "two")).metadata
+    cover = dataclasses.replace(
+        Snapshot.open(str(tmp_path / "two")).cover, origin=(edge - 70e3, three[mover][1] - 30e3), rows=1, columns=2, core=60e3, overlap=20e3
+    )
+    metadata = dataclasses.replace(metadata, cover=cover.to_mapping(), max_parameters=12)
+    beyond = {q for q in every if three[q][0] > edge + 100.0}
+    own = {q for q in every if max(two[q][0], three[q][0]) < edge - 20.1e3}
+    first, second = of_points(block, [0, 1], {mover} | beyond | own, "first"), of_points(block, [2], {mover} | beyond, "second")
+    create_network(str(tmp_path / "grown"), metadata)
+    for name, part in (("first", first), ("second", second)):
+        run(Catalogue.open(rewrite(catalogue, tmp_path / name, [part])), str(tmp_path / "grown"), HERE)
+    after = Snapshot.open(str(tmp_path / "grown"))
+    assert after.cover.splits == (1,)
+    create_network(str(tmp_path / "at-once"), dataclasses.replace(after.metadata, max_parameters=10**6))
+    run(Catalogue.open(rewrite(catalogue, tmp_path / "both", [first, second])), str(tmp_path / "at-once"), HERE)
+    assert after.sub_min(0).redundancy == Snapshot.open(str(tmp_path / "at-once")).sub_min(0).redundancy == len(own)
+    same_network(tmp_path / "grown", tmp_path / "at-once")
