@@ -1,12 +1,13 @@
 # The two commands of the README, and what they need. Only Python, git and make are expected to be there.
 PYTHON ?= python3
 # a second Python, to which networks must travel; looked for when not given
-OTHER_PYTHON ?= $(firstword $(wildcard $(HOME)/.pyenv/versions/3.13*/bin/python) $(shell command -v python3.13 2>/dev/null))
+PYENV := $(shell pyenv root 2>/dev/null || echo $(HOME)/.pyenv)
+OTHER_PYTHON ?= $(firstword $(wildcard $(PYENV)/versions/3.13*/bin/python) $(shell python3.13 -c 'import sys; print(sys.executable)' 2>/dev/null))
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 
-.PHONY: demo test check environment other-environment clean
+.PHONY: demo test check environment other-environment other-python clean
 
 demo: environment
 	rm -rf $(DEMO) && mkdir $(DEMO)
@@ -37,8 +38,12 @@ $(VENV)/.ready: pyproject.toml
 
 other-environment: $(VENV)-other/.ready
 
+# which one that would be; nothing where there is none
+other-python:
+	@echo "$(OTHER_PYTHON)"
+
 $(VENV)-other/.ready: pyproject.toml
-	test -n "$(OTHER_PYTHON)" || { echo "no second Python found: give OTHER_PYTHON=..."; exit 1; }
+	test -n "$(OTHER_PYTHON)" || { echo "no second Python found: give OTHER_PYTHON=python3.13 or another"; exit 1; }
 	$(OTHER_PYTHON) -m venv $(VENV)-other
 	$(VENV)-other/bin/python -m pip install --quiet --upgrade pip
 	$(VENV)-other/bin/python -m pip install --quiet --editable .
