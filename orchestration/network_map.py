@@ -243,7 +243,9 @@ def _draw_cores(axes: Axes, cover: Cover, view: _View, width: float) -> None:
     west, south, east, north = view.box
     axes.set(xlim=(west, east), ylim=(south, north), facecolor=GROUND, aspect="equal")
     core = _inches(cover.core, view, width)
-    lines = LineCollection(_grid(*_borders(cover, view)), colors=CORE, linewidths=float(np.clip(core, 0.15, 0.9)), zorder=2.1)
+    lines = LineCollection(
+        [*_grid(*_borders(cover, view)), *_crosses(cover, view)], colors=CORE, linewidths=float(np.clip(core, 0.15, 0.9)), zorder=2.1
+    )
     axes.add_collection(lines, autolim=False)
 
 
@@ -254,6 +256,8 @@ def _draw_tiles(axes: Axes, cover: Cover, view: _View, width: float) -> None:
         x, y = _borders(cover, view)
         # a tile reaches over the borders of its core; beyond the rim there is no neighbour that reaches back
         sides = _grid(np.concatenate([x[:-1] - half, x[1:] + half]), np.concatenate([y[:-1] - half, y[1:] + half]))
+        quarters = [q for tile in cover.splits for q in cover.quarters(tile) if q not in cover.splits]
+        sides += [cover.tile_outline(quarter) / view.metres for quarter in quarters]
         lines = LineCollection(sides, colors=TILE, linewidths=float(np.clip(0.7 * core, 0.15, 0.6)), alpha=0.65, zorder=2)
         lines.set_linestyle([DASHES])
         axes.add_collection(lines, autolim=False)
@@ -273,6 +277,17 @@ def _borders(cover: Cover, view: _View) -> tuple[Array, Array]:
         np.asarray(cover.origin[0] + cover.core * np.arange(cover.columns + 1.0)) / view.metres,
         np.asarray(cover.origin[1] + cover.core * np.arange(cover.rows + 1.0)) / view.metres,
     )
+
+
+def _crosses(cover: Cover, view: _View) -> list[Array]:
+    """Lines that cut split cores into quarters, in units."""
+    crosses = []
+    for tile in cover.splits:
+        outline = cover.core_outline(tile) / view.metres
+        (west, south), (east, north) = outline.min(axis=0), outline.max(axis=0)
+        x, y = 0.5 * (west + east), 0.5 * (south + north)
+        crosses += [np.array([[x, south], [x, north]]), np.array([[west, y], [east, y]])]
+    return crosses
 
 
 def _inches(length: float, view: _View, width: float) -> float:
@@ -437,7 +452,7 @@ def _draw_heading(figure: Figure, layout: _Layout, network: Network, points: Poi
     facts = "   ·   ".join((
         _number(len(points), "point"),
         _number(images.count, "image"),
-        f"{_number(cover.rows * cover.columns, 'tile')}, cores of {core}, overlap {overlap}",
+        f"{_number(cover.tile_count, 'tile')}, cores of {core}, overlap {overlap}",
         metadata.frame + (f", epoch {metadata.epoch}" if metadata.epoch else ""),
     ))  # fmt: skip
     left, top = layout.main[0] / layout.page[0], layout.page[1]
