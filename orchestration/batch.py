@@ -68,7 +68,8 @@ def fuse_batch(
     refused = list(rejected)
     accepted = _stage_one(blocks, base, executor, reporter, refused)
     blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, base, refused)
-    unsaid = [r for r in refused if not Ledger.of(base).said(r.block_id, r.reason)]
+    ledger = Ledger.of(base)
+    unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
     if not blocks and not unsaid:
         return BatchResult(base.number, (), tuple(refused), (), (), ())  # the same command again writes nothing
     settled = settle(session, base, move, executor, reporter)

@@ -77,13 +77,12 @@ class Settled:
     reports : of the judged tiles
     flags : pairs of tile and image row: the tile finds the image's camera bad
     gone : cells and tiles to be deleted, because nothing is left of them
-    used, rejected : rays (m,) by image row, in the cells that were judged
+    rejected : rays (m,) by image row, in the cells that were judged
     """
 
     reports: tuple[TileReport, ...]
     flags: frozenset[tuple[int, int]]
     gone: tuple[str, ...]
-    used: NDArray[np.int64]
     rejected: NDArray[np.int64]
 
     @property
@@ -233,15 +232,15 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     gone += [f"cells/{name}" for name in sorted(move.out.dissolved)]
     gone += [f"tiles/{move.cover.tile_name(t.tile)}" for t in factored if not t.images]
     gone += [f"tiles/{base.cover.tile_name(t)}" for t in split if t not in base.cover.splits]
-    used, rejected = _ray_counts((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
-    return Settled(tuple(reports), frozenset(flags), tuple(gone), used, rejected)
+    rejected = _rejected_rays((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
+    return Settled(tuple(reports), frozenset(flags), tuple(gone), rejected)
 
 
 def finish(
     session: icechunk.Session, base: Snapshot, move: Move, settled: Settled, records: Sequence[ImageRecord], entries: Sequence[Entry],
     message: str, withdrawn: Sequence[int] = (),
-) -> int:  # fmt: skip
-    """Write what the coordinator keeps, and commit: the number of the new version.
+) -> None:  # fmt: skip
+    """Write what the coordinator keeps, and commit.
 
     Parameters
     ----------
@@ -267,7 +266,6 @@ def finish(
         root.attrs.update(replace(base.metadata, cover=move.cover.to_mapping()).to_attributes())
     root.attrs["version"] = version
     commit(session, version, message)
-    return version
 
 
 def _tiles_that_see(base: Snapshot, rows: Collection[int]) -> set[int]:
@@ -276,12 +274,11 @@ def _tiles_that_see(base: Snapshot, rows: Collection[int]) -> set[int]:
     return {tile for tile in base.tile_numbers() if np.isin(old, base.tile_images(tile)).any()} if len(old) else set()
 
 
-def _ray_counts(cells: Iterable[CellReport], images: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    used, rejected = np.zeros(images, dtype=np.int64), np.zeros(images, dtype=np.int64)
+def _rejected_rays(cells: Iterable[CellReport], images: int) -> NDArray[np.int64]:
+    rejected = np.zeros(images, dtype=np.int64)
     for cell in cells:
-        np.add.at(used, cell.images, cell.used)
         np.add.at(rejected, cell.images, cell.rejected)
-    return used, rejected
+    return rejected
 
 
 def _write_flags(root: zarr.Group, flags: Collection[tuple[int, int]], before: Collection[tuple[int, int]]) -> None:

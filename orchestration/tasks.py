@@ -64,17 +64,16 @@ class FlaggedImage:
 
 @dataclass(frozen=True)
 class CellReport:
-    """Counts of a cell after a batch: accepted and rejected rays by image row."""
+    """Counts of a cell after a batch: rejected rays by image row."""
 
     images: NDArray[np.int32]
-    used: NDArray[np.int64]
     rejected: NDArray[np.int64]
 
     @classmethod
     def empty(cls) -> CellReport:
         """Of a cell without rays."""
         none = np.empty(0, dtype=np.int64)
-        return cls(none.astype(np.int32), none, none)
+        return cls(none.astype(np.int32), none)
 
 
 @dataclass(frozen=True)
@@ -272,8 +271,7 @@ def _images(snapshot: Snapshot, rows: NDArray[np.int32], new: Sequence[NetworkIm
 
 def _report(cell: Cell) -> CellReport:
     rays, m = cell.rays, len(cell.images)
-    used = np.bincount(rays.image[rays.accepted], minlength=m)
-    return CellReport(cell.images, used, np.bincount(rays.image, minlength=m) - used)
+    return CellReport(cell.images, np.bincount(rays.image[~rays.accepted], minlength=m))
 
 
 def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> tuple[FlaggedImage, ...]:
