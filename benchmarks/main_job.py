@@ -24,9 +24,12 @@ from submin.adjustment.estimation import estimate_images
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
+from submin.sensors import sensor_named
 from submin.simulation.region import RegionDesign, image_priors, packed_cameras, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.simulated import write_region
+
+RPC = sensor_named("rpc")
 
 
 def measure(scale: float, workers: int) -> list[dict[str, Any]]:
@@ -35,7 +38,7 @@ def measure(scale: float, workers: int) -> list[dict[str, Any]]:
     region = simulate_region(RegionDesign(width_km=side, height_km=side))
     images = ImageSet(
         tuple(i.image_id for i in region.images), tuple(i.sensor for i in region.images), packed_cameras(region.images),
-        tuple(image_priors(region.images, region.design.priors)),
+        tuple(image_priors(region.images, region.design.priors)), len(RPC.parameters),
     )  # fmt: skip
     rays = sorted_rays(
         region.point, region.image, np.column_stack([region.sample, region.line]),

@@ -19,6 +19,7 @@ from orchestration.progress import Reporter
 from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, report_of, update_tile
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import LooseRays, Registration, contradictions, register, taken_out, together
+from submin.sensors import width_of
 from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
 from submin.storage.catalogue_schema import ImageRecord
 from submin.storage.ledger import Entry, append_entries
@@ -55,13 +56,14 @@ class Move:
 
     Attributes
     ----------
-    cover : tiles of the new version
+    cover : tiles of the new version; parameters : adjustable parameters that it keeps for each image
     out : points taken out; registration : where they and the arriving ones go, rays of these first
     contradictions : blocks that measure a point elsewhere than what came before them, see `registration.contradictions`
     images : images that are new with this change, in the order of their rows
     """
 
     cover: Cover
+    parameters: int
     out: TakenOut
     registration: Registration
     contradictions: dict[int, tuple[str, float]]
@@ -123,16 +125,17 @@ def take_points_seen(base: Snapshot, images: Index) -> TakenOut:
 def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequence[NetworkImage]) -> Move:
     """Register the points taken out with their remaining and arriving rays; split the tiles that would then hold too many images."""
     cover, stored = base.cover, Stored.of(base)
+    parameters = max(base.metadata.parameters, width_of(image.sensor for image in new_images))
     while True:
         rays = together([arriving, out.rays])
         first = base.image_count()
         old = np.unique(rays.image[rays.image < first]).astype(np.int32)
         rows = np.concatenate([old, np.arange(first, first + len(new_images), dtype=np.int32)])
-        images = image_set([*base.images(old), *new_images], base.metadata.ellipsoid, base.metadata.parameters)
+        images = image_set([*base.images(old), *new_images], base.metadata.ellipsoid, parameters)
         registration = register(rays, images, rows, cover)
         full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(stored, cover, tile, out, registration)]
         if not full:
-            return Move(cover, out, registration, contradictions(rays, registration, images, rows, cover), tuple(new_images))
+            return Move(cover, parameters, out, registration, contradictions(rays, registration, images, rows, cover), tuple(new_images))
         for tile in full:
             if tile not in cover.splits:  # not yet, as the larger neighbour of another one
                 cover = cover.split(tile)
@@ -262,8 +265,9 @@ def finish(
     ids, at = move.registration.directory
     listed = (at >= 0) & (base.candidate_cells(ids) != at)
     append_table(group_of(root, "directory"), {"hash": hash_ids(ids[listed]), "cell": at[listed]})
-    if move.cover.splits != base.cover.splits:
-        root.attrs.update(replace(base.metadata, cover=move.cover.to_mapping()).to_attributes())
+    metadata = replace(base.metadata, cover=move.cover.to_mapping(), parameters=move.parameters)
+    if metadata != base.metadata:
+        root.attrs.update(metadata.to_attributes())
     root.attrs["version"] = version
     commit(session, version, message)
 

@@ -13,7 +13,8 @@ from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
 from submin.formats.columns import required_path
-from submin.sensors import WIDEST, sensor_named
+from submin.geodesy import Ellipsoid
+from submin.sensors import sensor_named, width_of
 from submin.storage.catalogue import Catalogue, read_footprint
 from submin.storage.catalogue_schema import CatalogueMetadata, ImageRecord
 from submin.storage.network_store import create_network
@@ -67,7 +68,7 @@ def create(
     network = NetworkMetadata(
         name=Path(place).name, body=metadata.body, frame=metadata.frame, epoch=metadata.epoch,
         semimajor_axis=metadata.semimajor_axis, flattening=metadata.flattening, cover=cover.to_mapping(), form=form,
-        parameters=WIDEST, max_parameters=max_parameters,
+        parameters=width_of(["rpc"]), max_parameters=max_parameters,
     )  # fmt: skip
     create_network(place, network)
     return Created(place, cover, network)
@@ -115,7 +116,7 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     footprints, path = [], required_path(catalogue.path, "images")
     for row, image in enumerate(catalogue.images, start=1):
         if image.footprint:
-            footprints.append(_footprint(image, f"{path}: row {row}: geometry of image {image.image_id}"))
+            footprints.append(_footprint(image, catalogue.metadata.ellipsoid, f"{path}: row {row}: geometry of image {image.image_id}"))
     if not footprints:
         raise InputError(f"{catalogue.path}: no image has a footprint (column geometry); give the area by --bbox or --aoi")
     west, south, east, north = shapely.total_bounds(footprints)
@@ -125,13 +126,13 @@ def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     return shapely.box(west, south, east, north), CORE_IN_FOOTPRINTS * width, width
 
 
-def _footprint(image: ImageRecord, name: str) -> BaseGeometry:
+def _footprint(image: ImageRecord, ellipsoid: Ellipsoid, name: str) -> BaseGeometry:
     """The footprint of an image, on the globe and not with its axes swapped."""
     footprint = read_footprint(image.footprint, name)
     if footprint.is_empty:
         raise InputError(f"{name} is empty; expected a polygon in longitude and latitude")
     west, south, east, north = footprint.bounds
-    longitude, latitude = _centre_on_ground(image)
+    longitude, latitude = _centre_on_ground(image, ellipsoid)
     x, y = 0.5 * (west + east), 0.5 * (south + north)
     swapped = np.hypot(x - latitude, y - longitude) < 0.1 * np.hypot((x - longitude + 180.0) % 360.0 - 180.0, y - latitude)
     if swapped or not (-90.0 <= south <= north <= 90.0 and -360.0 <= west <= east <= 360.0):
@@ -143,9 +144,9 @@ def _footprint(image: ImageRecord, name: str) -> BaseGeometry:
     return footprint
 
 
-def _centre_on_ground(image: ImageRecord) -> tuple[float, float]:
+def _centre_on_ground(image: ImageRecord, ellipsoid: Ellipsoid) -> tuple[float, float]:
     """Longitude and latitude of the middle of an image, at its camera's mean height."""
     sensor, camera = sensor_named(image.sensor), image.pack()[None]
     sample, line = np.array([0.5 * image.width]), np.array([0.5 * image.height])
-    at = sensor.localise(camera, np.zeros(1, dtype=np.int32), sample, line, sensor.mean_height(camera))[0]
+    at = sensor.localise(camera, np.zeros(1, dtype=np.int32), sample, line, sensor.mean_height(camera), ellipsoid)[0]
     return float(at[0]), float(at[1])

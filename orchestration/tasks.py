@@ -23,7 +23,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import add_sums, factor
-from submin.sensors import sensor_named
+from submin.sensors import sensor_named, width_of
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import write_cell, write_sub_min
 from submin.tiling.cover import Cover
@@ -115,7 +115,7 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
     """Stage 1 of one block."""
     accepted = np.ones(len(block.image), dtype=np.bool_)
     try:
-        images = image_set(block.images, ellipsoid)
+        images = image_set(block.images, ellipsoid, width_of(image.sensor for image in block.images))
         ids, point = np.unique(block.point_ids, return_inverse=True)
         order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
         rays = sorted_rays(point.astype(np.int32), block.image, block.observed, block.sigma, accepted)
@@ -156,7 +156,7 @@ def update_tile(
     on less evidence, from the registered positions, images in the order of their ids (decision 006).
     """
     root = zarr.open_group(writes.store, mode="r+")
-    snapshot = Snapshot(root, "network", cover)
+    snapshot = Snapshot(root, "network", cover, width_of(image.sensor for image in new_images))
     held = []
     for number in cover.cells_held(tile):
         cell = snapshot.cell(number)
@@ -235,7 +235,7 @@ def factor_tile(
     ``released`` are the rows of all images in the network whose prior is released.
     """
     root = zarr.open_group(writes.store, mode="r+")
-    snapshot = Snapshot(root, "network", cover)
+    snapshot = Snapshot(root, "network", cover, width_of(image.sensor for image in new_images))
     fresh = {number: sums for update in updates for number, sums in update.sums.items()}
     parts = []
     cells = []
@@ -277,13 +277,21 @@ def _report(cell: Cell) -> CellReport:
 def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> tuple[FlaggedImage, ...]:
     flagged = []
     for k in np.flatnonzero(result.released):
-        model, names = images.priors[k].a_priori, sensor_named(images.sensors[k]).parameters
+        model, parameters = images.priors[k].a_priori, sensor_named(images.sensors[k]).parameters
         assert model is not None
-        sigma = np.where(np.isin(np.arange(images.parameters), images.priors[k].bias), model.bias_px, model.drift_px)
-        worst = int(np.argmax(np.abs(result.theta[k]) / sigma))
+        sigma = np.array([model.of(parameter).sigma for parameter in parameters])
+        adjustable = np.flatnonzero(sigma > 0.0)
+        worst = int(adjustable[np.argmax(np.abs(result.theta[k][adjustable]) / sigma[adjustable])])
+        name, unit = parameters[worst].name, parameters[worst].unit
         flagged.append(FlaggedImage(
             int(rows[k]), images.ids[k],
-            f"{names[worst]} of the camera is {result.theta[k, worst]:.1f} px where its a priori sigma is {sigma[worst]:g} px "
+            f"{name} of the camera is {_rounded(result.theta[k, worst], sigma[worst])} {unit} where its a priori sigma is "
+            f"{sigma[worst]:g} {unit} "
             f"(test statistic {result.image_statistic[k]:.1f}); its prior is no longer used",
         ))  # fmt: skip
     return tuple(flagged)
+
+
+def _rounded(value: float, sigma: float) -> str:
+    """A value with one digit beyond the first of its sigma."""
+    return f"{value:.{max(0, 1 - int(np.floor(np.log10(sigma))))}f}"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.blunders import bad_cameras, image_statistics, reject_blunders, residuals, robust_weights
-from submin.adjustment.elimination import LinearRays, eliminate, ground_corrections, linearise, point_factors
+from submin.adjustment.elimination import LinearRays, eliminate, ground_corrections, linearise, moved_rays, point_factors
 from submin.adjustment.estimation import ImageEstimate, estimate_images, prior_variance
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays
@@ -28,7 +28,8 @@ FREE_DECISIONS = 12
 REACH_METRES = 5000.0
 """A point is linearised no farther than this from where it was registered. The estimate of a weak point (rays of one viewpoint) may lie
 anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours to choose."""
-CONVERGED_PIXELS = 1e-6
+CONVERGED_SIGMAS = 2e-6
+"""A step that moves no ray by more than this, in sigmas of its measurement, is none."""
 CONVERGED_METRES = 1e-5
 
 
@@ -91,7 +92,7 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     while not converged and judgements < MAX_ITERATIONS:
         judgements += 1
         linear, estimate, reached = _step(images, rays, theta, ground, anchor, weight)
-        step_px = np.abs(estimate.theta - theta).max(initial=0.0)
+        step = np.abs(moved_rays(linear, estimate.theta - theta)).max(initial=0.0)
         step_m = np.abs(reached - ground).max(initial=0.0)
         theta, ground = estimate.theta, reached
         judged, statistic = reject_blunders(
@@ -102,7 +103,7 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         bad = bad_cameras(worst, linear) & ~released & np.array_equal(judged, weight)
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
         converged = (
-            step_px < CONVERGED_PIXELS and step_m < CONVERGED_METRES and not bad.any() and bool(np.array_equal(judged, weight))
+            step < CONVERGED_SIGMAS and step_m < CONVERGED_METRES and not bad.any() and bool(np.array_equal(judged, weight))
         )  # fmt: skip
         weight, released = judged, released | bad
         images = images.release(bad) if bad.any() else images

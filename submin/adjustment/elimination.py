@@ -229,8 +229,13 @@ def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) 
     return corrections
 
 
+def moved_rays(linear: LinearRays, theta: Array) -> Array:
+    """By how much (r, 2), in sigmas, image corrections (m, p) move the image coordinates of rays."""
+    return np.asarray(np.einsum("rcp,rp->rc", linear.by_parameters, theta[linear.image]))
+
+
 def residuals_of(linear: LinearRays, theta: Array, correction: Array) -> Array:
     """Linear residuals (r, 2) in sigmas of all rays at image corrections (m, p) and ground corrections ``x - x0`` (n, 3)."""
     point = np.repeat(np.arange(len(correction)), np.diff(linear.first))
-    residual = linear.y - np.einsum("rcp,rp->rc", linear.by_parameters, theta[linear.image])
+    residual = linear.y - moved_rays(linear, theta)
     return np.asarray(residual - np.einsum("rck,rk->rc", linear.by_ground, correction[point]))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from submin.adjustment.priors import ImagePrior, prior_factor
 from submin.geodesy import WGS84, Ellipsoid
-from submin.sensors import WIDEST, Ground, Projection, sensor_named
+from submin.sensors import Ground, Projection, sensor_named
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -28,16 +28,16 @@ class ImageSet:
     sensors : name of each image's sensor model
     cameras : (m, c) packed cameras; rows of sensors with fewer numbers are padded with NaN
     priors : what the a priori factor needs, by image
+    parameters : adjustable parameters kept for each image, those of its sensor first
     ellipsoid : of the body that they look at
-    parameters : adjustable parameters kept for each image
     """
 
     ids: tuple[str, ...]
     sensors: tuple[str, ...]
     cameras: Array
     priors: tuple[ImagePrior, ...]
+    parameters: int
     ellipsoid: Ellipsoid = WGS84
-    parameters: int = WIDEST
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -59,8 +59,8 @@ class ImageSet:
             tuple(self.sensors[i] for i in rows),
             self.cameras[np.asarray(rows, dtype=np.int64)],
             tuple(self.priors[i] for i in rows),
-            self.ellipsoid,
             self.parameters,
+            self.ellipsoid,
         )
 
     def release(self, which: NDArray[np.bool_]) -> ImageSet:
@@ -95,5 +95,5 @@ class ImageSet:
             sensor, rays = sensor_named(name), of_image[image] == name
             heights = sensor.mean_height(self.cameras)[image[rays]]
             samples, lines = np.ascontiguousarray(observed[rays, 0]), np.ascontiguousarray(observed[rays, 1])
-            ground[rays] = sensor.localise(self.cameras, image[rays], samples, lines, heights)
+            ground[rays] = sensor.localise(self.cameras, image[rays], samples, lines, heights, self.ellipsoid)
         return ground

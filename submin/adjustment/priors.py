@@ -1,17 +1,17 @@
 """A priori model of the images' adjustable parameters, as a factor: what is believed of a camera before any measurement.
 
-The correction of an image is the sum of a part of its own and a part common to all images of its pass. Both are written by whitened vectors
-``u`` with covariance I (docs/mathematics.md, "Parameter vectors are held whitened"): ``theta = K u``, so the a priori covariance is ``Q =
-K K'`` and
-``Q^-1`` is never formed. Correlations between the images of a block are factored as *correlation* matrices, of which the nearly singular
-ones
-(images seconds apart) lose nothing: a negative computed eigenvalue is clipped to zero, which only says that two corrections are equal.
+The correction of a parameter is the sum of a part of the image's own and a part common to all images of its pass. Both are written by
+whitened vectors ``u`` with covariance I (docs/mathematics.md, "Parameter vectors are held whitened"): ``theta = K u``, so the a priori
+covariance is ``Q = K K'`` and ``Q^-1`` is never formed. Correlations between the images of a block are factored as *correlation* matrices,
+of which the nearly singular ones (images seconds apart) lose nothing: a negative computed eigenvalue is clipped to zero, which only says
+that two corrections are equal.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from submin.errors import InputError
+from submin.sensors.base import Parameter
 
 Array = NDArray[np.float64]
 
@@ -27,43 +28,42 @@ RELEASE_FACTOR = 100.0
 the network (decision 004)."""
 
 CORRELATION_MODELS = ("none", "fixed", "exponential", "gaussian")
+CORRECTIONS = {
+    "shift": ("bias",),
+    "shift+drift": ("bias", "drift along lines"),
+    "affine": ("bias", "drift along lines", "drift along samples"),
+}
+"""Groups of parameters of an RPC that are adjustable, by the name of the correction: along lines is along the time of a scan."""
+_SIGMA_OF_GROUP = {"bias": "bias_px", "drift along lines": "drift_px", "drift along samples": "drift_px"}
 
 
 @dataclass(frozen=True)
-class APriori:
-    """A priori sigmas of an image-space correction and how they are shared.
+class Uncertainty:
+    """What is believed of one parameter of an image.
 
     Parameters
     ----------
-    bias_px : float
-        Total sigma of the shift of an image, in sample and in line each, pixels.
-    drift_px : float
-        Sigma of each of the four drift parameters: the shift at the edge of the image, pixels.
+    sigma : float
+        Total sigma, in the unit of the parameter; 0 holds it as it is.
     common_to_pass : float
-        Part (0 to 1) of the *variance* of the shift that all images of one pass share.
-    correlation : str
-        Correlation of the images' own parts within a block: ``none``, ``fixed`` (the same between any two), ``exponential``
-        ``exp(-dt/T)`` or ``gaussian`` ``exp(-(dt/T)^2)`` in the time between the images.
-    correlation_parameter : float
-        For ``fixed`` the correlation (0 to below 1); for the temporal models T in seconds.
+        Part (0 to 1) of its *variance* that all images of one pass share.
+    correlation, correlation_parameter : str, float
+        Of the images' own parts within a block, see `APriori`.
 
     Raises
     ------
     InputError
-        When a sigma is not positive, a part not within 0 to 1, or a model unknown.
+        When a value is out of its range.
     """
 
-    bias_px: float = 10.0
-    drift_px: float = 1.0
-    common_to_pass: float = 0.5
+    sigma: float
+    common_to_pass: float = 0.0
     correlation: str = "none"
     correlation_parameter: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("bias_px", "drift_px"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"priors: {name} is {value}; expected a positive number of pixels")
+        if not (np.isfinite(self.sigma) and self.sigma >= 0.0):
+            raise InputError(f"priors: sigma is {self.sigma}; expected 0 (held as it is) or a positive number")
         if not 0.0 <= self.common_to_pass <= 1.0:
             raise InputError(f"priors: common_to_pass is {self.common_to_pass}; expected a part of the variance, 0 to 1")
         if self.correlation not in CORRELATION_MODELS:
@@ -72,23 +72,6 @@ class APriori:
             raise InputError(f"priors: fixed correlation is {self.correlation_parameter}; expected 0 to below 1")
         if self.correlation in ("exponential", "gaussian") and not self.correlation_parameter > 0.0:
             raise InputError(f"priors: time constant is {self.correlation_parameter}; expected a positive number of seconds")
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> APriori:
-        """The model of an entry of ``priors.json``; an unknown key is refused."""
-        known = {f: values[f] for f in cls.__dataclass_fields__ if f in values}
-        unknown = sorted(set(values) - set(known))
-        if unknown:
-            raise InputError(f"priors: unknown key {unknown[0]!r}; expected some of {', '.join(cls.__dataclass_fields__)}")
-        try:
-            model = str(known.pop("correlation", "none"))
-            return cls(correlation=model, **{name: float(value) for name, value in known.items()})
-        except (TypeError, ValueError):
-            raise InputError(f"priors: {dict(values)!r} holds something that is not a number") from None
-
-    def to_mapping(self) -> dict[str, Any]:
-        """The entry of ``priors.json``."""
-        return {f: getattr(self, f) for f in self.__dataclass_fields__}
 
     def correlations(self, seconds: Array) -> Array:
         """Correlation matrix (n, n) of the own parts of n images taken at these times (n,), in seconds; NaN where unknown."""
@@ -104,14 +87,127 @@ class APriori:
 
 
 @dataclass(frozen=True)
+class APriori:
+    """A priori sigmas of the adjustable parameters of images, and how they are shared.
+
+    Parameters
+    ----------
+    bias_px : float
+        Total sigma of the shift of an RPC image, in sample and in line each, pixels.
+    drift_px : float
+        Sigma of each drift parameter of an RPC image: the shift at the edge of the image, pixels.
+    common_to_pass : float
+        Part (0 to 1) of the *variance* that all images of one pass share, of the parameters that a sensor says a pass can share
+        (the shift of an RPC image).
+    correlation : str
+        Correlation of the images' own parts within a block: ``none``, ``fixed`` (the same between any two), ``exponential``
+        ``exp(-dt/T)`` or ``gaussian`` ``exp(-(dt/T)^2)`` in the time between the images.
+    correlation_parameter : float
+        For ``fixed`` the correlation (0 to below 1); for the temporal models T in seconds.
+    correction : str
+        Which parameters of an RPC image are adjustable: ``shift``, ``shift+drift`` (along lines, that is in time) or ``affine``.
+    parameters : mapping
+        What differs for some parameters, by their name or group (see `submin.sensors.base.Parameter`): any of ``sigma`` (in the
+        parameter's unit), ``common_to_pass``, ``correlation``, ``correlation_parameter``. A name goes before its group.
+
+    Raises
+    ------
+    InputError
+        When a sigma is not positive, a part not within 0 to 1, or a model unknown.
+    """
+
+    bias_px: float = 10.0
+    drift_px: float = 1.0
+    common_to_pass: float = 0.5
+    correlation: str = "none"
+    correlation_parameter: float = 0.0
+    correction: str = "affine"
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        for name in ("bias_px", "drift_px"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"priors: {name} is {value}; expected a positive number of pixels")
+        if self.correction not in CORRECTIONS:
+            raise InputError(f"priors: correction is {self.correction!r}; expected one of {', '.join(CORRECTIONS)}")
+        Uncertainty(1.0, self.common_to_pass, self.correlation, self.correlation_parameter)
+        for name, entry in self.parameters.items():
+            if not isinstance(entry, Mapping):
+                raise InputError(f"priors: parameters: {name!r} is {entry!r}; expected an object with some of {', '.join(_UNCERTAINTY)}")
+            unknown = sorted(set(entry) - set(_UNCERTAINTY))
+            if unknown:
+                raise InputError(f"priors: parameters: {name!r}: unknown key {unknown[0]!r}; expected some of {', '.join(_UNCERTAINTY)}")
+            _uncertainty(name, {"sigma": 1.0, **self._common, **entry})
+
+    @property
+    def _common(self) -> dict[str, Any]:
+        return {"correlation": self.correlation, "correlation_parameter": self.correlation_parameter}
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> APriori:
+        """The model of an entry of ``priors.json``; an unknown key is refused."""
+        names = [f.name for f in fields(cls)]
+        unknown = sorted(set(values) - set(names))
+        if unknown:
+            raise InputError(f"priors: unknown key {unknown[0]!r}; expected some of {', '.join(names)}")
+        known: dict[str, Any] = {name: str(values[name]) for name in ("correlation", "correction") if name in values}
+        by_parameter = values.get("parameters", {})
+        if not isinstance(by_parameter, Mapping):
+            raise InputError(f"priors: parameters is {by_parameter!r}; expected an object with an entry by parameter or group")
+        try:
+            known |= {name: float(value) for name, value in values.items() if name not in (*known, "parameters")}
+        except (TypeError, ValueError):
+            raise InputError(f"priors: {dict(values)!r} holds something that is not a number") from None
+        return cls(**known, parameters=by_parameter)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The entry of ``priors.json``; what is as it would be without an entry is left out of ``parameters`` and ``correction``."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values["parameters"] = {name: dict(entry) for name, entry in self.parameters.items()}
+        for name in ("correction", "parameters"):
+            if values[name] == getattr(_PLAIN, name):
+                del values[name]
+        return values
+
+    def of(self, parameter: Parameter) -> Uncertainty:
+        """What is believed of a parameter of a sensor."""
+        sigma = parameter.sigma
+        if parameter.group in _SIGMA_OF_GROUP:
+            sigma = getattr(self, _SIGMA_OF_GROUP[parameter.group]) if parameter.group in CORRECTIONS[self.correction] else 0.0
+        stated = {"sigma": sigma, "common_to_pass": self.common_to_pass if parameter.shared else 0.0, **self._common}
+        for name in (parameter.group, parameter.name):
+            stated |= self.parameters.get(name, {})
+        return _uncertainty(parameter.name, stated)
+
+
+_UNCERTAINTY = tuple(f.name for f in fields(Uncertainty))
+_PLAIN = APriori()
+
+
+def _uncertainty(name: str, values: Mapping[str, Any]) -> Uncertainty:
+    """The uncertainty of some values, which ``name`` names in errors."""
+    try:
+        known: dict[str, Any] = {key: str(value) if key == "correlation" else float(value) for key, value in values.items()}
+        return Uncertainty(**known)
+    except (TypeError, ValueError):
+        raise InputError(f"priors: parameters: {name!r} holds something that is not a number: {dict(values)!r}") from None
+    except InputError as error:
+        raise InputError(f"priors: parameters: {name!r}: {str(error).removeprefix('priors: ')}") from None
+
+
+@dataclass(frozen=True)
 class ImagePrior:
-    """What the a priori factor needs to know of one image; ``a_priori`` is None when it has nothing to adjust."""
+    """What the a priori factor needs to know of one image; ``a_priori`` is None when it has nothing to adjust.
+
+    ``parameters`` are those of its sensor, the first ones of the image's parameters.
+    """
 
     block_id: str
     pass_id: str
     seconds: float
     a_priori: APriori | None
-    bias: tuple[int, ...]
+    parameters: tuple[Parameter, ...]
     released: bool = False
 
 
@@ -124,54 +220,83 @@ def correlation_factor(correlation: Array) -> Array:
 def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     """Factor ``K`` (m p, q) of the a priori covariance of m images with p parameters each, image-major.
 
-    Columns are whitened vectors: one for every image and parameter (its block's own parts), and two for every pass. An image without
-    a priori model has none: its parameters are zero. Images may be any subset of a network: ``K K'`` is then the marginal of the whole
-    prior.
+    Columns are whitened vectors: one for every image and adjustable parameter (its block's own parts), and one for every pass and
+    parameter that its images share. An image without a priori model has none: its parameters are zero, as are those that its sensor does
+    not have. Images may be any subset of a network: ``K K'`` is then the marginal of the whole prior.
     """
     m, p = len(images), parameters
-    rows: list[NDArray[np.int64]] = []
-    columns: list[NDArray[np.int64]] = []
-    values: list[Array] = []
-    blocks: dict[str, list[int]] = {}
-    passes: dict[str, list[int]] = {}
+    blocks: dict[tuple[str, tuple[Parameter, ...]], list[int]] = {}
+    shared: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for i, image in enumerate(images):
         if image.a_priori is not None:
-            blocks.setdefault(image.block_id, []).append(i)
-            passes.setdefault(image.pass_id, []).append(i)
+            blocks.setdefault((image.block_id, image.parameters), []).append(i)
+            for c, parameter in enumerate(image.parameters):
+                stated = _stated(image.a_priori, parameter)
+                if stated.common_to_pass > 0.0 and stated.sigma > 0.0:
+                    common = stated.sigma * np.sqrt(stated.common_to_pass)
+                    shared.setdefault((image.pass_id, parameter.name), []).append((i * p + c, common))
 
-    column_of = np.cumsum([0, *(image.a_priori is not None for image in images)]) * p
-    for members in blocks.values():
+    entries, columns = _Entries(), 0
+    for (_, names), members in blocks.items():
         model = images[members[0]].a_priori
         assert model is not None
-        own = np.full((len(members), p), model.drift_px)
-        released = np.array([images[i].released for i in members])
-        for k, i in enumerate(members):
-            own[k, list(images[i].bias)] = model.bias_px * (1.0 if released[k] else np.sqrt(1.0 - model.common_to_pass))
-        own[released] *= RELEASE_FACTOR
-        # what a bad camera does says nothing of its neighbours: correlated at a hundred times the sigma, it would pin them
-        correlation = model.correlations(np.array([images[i].seconds for i in members]))
-        alone = released[:, None] | released[None, :]
-        np.fill_diagonal(alone, False)
-        factor = correlation_factor(np.where(alone, 0.0, correlation))
         at = np.array(members)
-        for c in range(p):
-            row, column = np.meshgrid(at * p + c, column_of[at] + c, indexing="ij")
-            rows.append(row.ravel())
-            columns.append(column.ravel())
-            values.append((factor * own[:, c : c + 1]).ravel())
+        seconds = np.array([images[i].seconds for i in members])
+        released = np.array([images[i].released for i in members])
+        factors: dict[tuple[str, float], Array] = {}
+        for c, parameter in enumerate(names):
+            stated = _stated(model, parameter)
+            if not stated.sigma > 0.0:
+                continue
+            key = stated.correlation, stated.correlation_parameter
+            if key not in factors:
+                factors[key] = _own_factor(stated, seconds, released)
+            own = stated.sigma * np.where(released, RELEASE_FACTOR, np.sqrt(1.0 - stated.common_to_pass))
+            entries.add(at * p + c, columns + np.arange(len(members)), factors[key] * own[:, None])
+            columns += len(members)
+    for k, members_of_pass in enumerate(shared.values()):
+        rows, sigmas = zip(*members_of_pass, strict=True)
+        entries.add(np.array(rows), np.array([columns + k]), np.array(sigmas)[:, None])
+    return entries.factor((m * p, columns + len(shared)))
 
-    for k, members in enumerate(passes.values()):
-        for i in members:
-            model = images[i].a_priori
-            assert model is not None
-            shared = model.bias_px * np.sqrt(model.common_to_pass)
-            rows.append(i * p + np.array(images[i].bias))
-            columns.append(column_of[-1] + 2 * k + np.arange(2))
-            values.append(np.full(2, shared))
 
-    shape = (m * p, int(column_of[-1]) + 2 * len(passes))
-    if not blocks:
-        return sp.csr_array(shape)
-    factor_k = sp.coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape).tocsr()
-    factor_k.eliminate_zeros()
-    return factor_k
+@lru_cache(maxsize=1024)
+def _stated(model: APriori, parameter: Parameter) -> Uncertainty:
+    return model.of(parameter)
+
+
+def _own_factor(stated: Uncertainty, seconds: Array, released: NDArray[np.bool_]) -> Array:
+    """Factor of the correlation of a block's own parts of one parameter.
+
+    What a bad camera does says nothing of its neighbours: correlated at a hundred times the sigma, it would pin them.
+    """
+    correlation = stated.correlations(seconds)
+    if stated.correlation == "none":
+        return correlation
+    alone = released[:, None] | released[None, :]
+    np.fill_diagonal(alone, False)
+    return correlation_factor(np.where(alone, 0.0, correlation))
+
+
+class _Entries:
+    """Dense pieces of a sparse matrix, collected."""
+
+    def __init__(self) -> None:
+        self._rows: list[NDArray[np.int64]] = []
+        self._columns: list[NDArray[np.int64]] = []
+        self._values: list[Array] = []
+
+    def add(self, rows: NDArray[np.int64], columns: NDArray[np.int64], values: Array) -> None:
+        """``values`` (n, k) at n rows and k columns."""
+        self._rows.append(np.repeat(rows, len(columns)))
+        self._columns.append(np.tile(columns, len(rows)))
+        self._values.append(values.ravel())
+
+    def factor(self, shape: tuple[int, int]) -> sp.csr_array:
+        """The whole matrix, without stored zeros."""
+        if not self._rows:
+            return sp.csr_array(shape)
+        at = np.concatenate(self._rows), np.concatenate(self._columns)
+        matrix = sp.coo_array((np.concatenate(self._values), at), shape=shape).tocsr()
+        matrix.eliminate_zeros()
+        return matrix

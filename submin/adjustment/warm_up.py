@@ -24,8 +24,8 @@ def compile_kernels() -> None:
         samples[1], lines[2], lines[3] = 1.0, 1.0, tilt
         polynomials = {"SAMP_NUM_COEFF": samples, "SAMP_DEN_COEFF": one, "LINE_NUM_COEFF": lines, "LINE_DEN_COEFF": one}
         cameras.append(sensor_named("rpc").pack(camera | polynomials, 2000, 2000))
-    priors = tuple(ImagePrior("warm", "up", float("nan"), APriori(), (0, 3)) for _ in cameras)
-    images = ImageSet(("a", "b"), ("rpc", "rpc"), np.array(cameras), priors)
+    priors = tuple(ImagePrior("warm", "up", float("nan"), APriori(), sensor_named("rpc").parameters) for _ in cameras)
+    images = ImageSet(("a", "b"), ("rpc", "rpc"), np.array(cameras), priors, len(sensor_named("rpc").parameters))
     index = np.array([0, 0, 1, 1], dtype=np.int32)
     observed = np.array([[10.0, 20.0], [10.5, 20.0], [90.0, 70.0], [90.0, 71.0]])
     image = np.array([0, 1, 0, 1], dtype=np.int32)

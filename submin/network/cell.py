@@ -76,6 +76,31 @@ def empty_sums(images: int, parameters: int) -> Sums:
     return Sums(np.zeros((images * parameters, images * parameters)), np.zeros(images * parameters), 0.0, 0)
 
 
+def widened(cell: Cell, parameters: int) -> Cell:
+    """The cell with so many parameters an image: what is added says and is nothing."""
+    images, old = cell.theta.shape
+    if old == parameters:
+        return cell
+    theta = np.zeros((images, parameters))
+    theta[:, :old] = cell.theta
+    sums = widened_sums(cell.sums, images, parameters) if len(cell.sums.vector) else cell.sums
+    return replace(cell, theta=theta, sums=sums)
+
+
+def widened_sums(sums: Sums, images: int, parameters: int) -> Sums:
+    """Sums about m images with so many parameters an image."""
+    rows = kept_rows(images, len(sums.vector) // max(images, 1), parameters)
+    wide = empty_sums(images, parameters)
+    wide.information[np.ix_(rows, rows)] = sums.information
+    wide.vector[rows] = sums.vector
+    return replace(sums, information=wide.information, vector=wide.vector)
+
+
+def kept_rows(images: int, old: int, new: int) -> NDArray[np.int64]:
+    """Places (m old,) of the parameters of m images when each gets ``new`` of them, the ``old`` ones first."""
+    return np.asarray((np.arange(images)[:, None] * new + np.arange(old)).ravel())
+
+
 def empty_cell(number: int, parameters: int) -> Cell:
     """A cell without points."""
     none = np.empty(0, dtype=np.int32)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori, ImagePrior
 from submin.geodesy import Ellipsoid
-from submin.sensors import WIDEST, sensor_named
+from submin.sensors import sensor_named
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def _a_priori(text: str) -> APriori | None:
     return APriori.from_mapping(json.loads(text)) if text else None
 
 
-def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: int = WIDEST) -> ImageSet:
+def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: int) -> ImageSet:
     """The images with packed cameras and a priori models, ``parameters`` adjustable ones kept for each.
 
     Raises
@@ -65,6 +65,6 @@ def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: 
     for row, camera in zip(packed, cameras, strict=True):
         row[: len(camera)] = camera
     priors = tuple(
-        ImagePrior(i.block_id, i.pass_id, i.seconds, _a_priori(i.a_priori), sensor_named(i.sensor).bias, i.released) for i in images
+        ImagePrior(i.block_id, i.pass_id, i.seconds, _a_priori(i.a_priori), sensor_named(i.sensor).parameters, i.released) for i in images
     )
-    return ImageSet(tuple(i.image_id for i in images), tuple(i.sensor for i in images), packed, priors, ellipsoid, parameters)
+    return ImageSet(tuple(i.image_id for i in images), tuple(i.sensor for i in images), packed, priors, parameters, ellipsoid)

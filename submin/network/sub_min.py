@@ -9,7 +9,7 @@ own rays (docs/mathematics.md, "Factored form"). The dense covariance of all poi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as la
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from submin.adjustment.elimination import LinearRays, PointFactors, Sums, ground_corrections
 from submin.adjustment.estimation import estimate_images, fill_symmetric
 from submin.adjustment.images import ImageSet
-from submin.network.cell import empty_sums, reordered
+from submin.network.cell import empty_sums, kept_rows, reordered
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -46,6 +46,18 @@ class SubMin:
     covariance: Array
     chi_square: float
     redundancy: int
+
+
+def wider(sub_min: SubMin, parameters: int) -> SubMin:
+    """The sub-MIN with so many parameters an image: what is added is zero, and known to be."""
+    images, old = sub_min.theta.shape
+    if old == parameters:
+        return sub_min
+    rows = kept_rows(images, old, parameters)
+    theta, covariance = np.zeros((images, parameters)), np.zeros((images * parameters, images * parameters))
+    theta[:, :old] = sub_min.theta
+    covariance[np.ix_(rows, rows)] = sub_min.covariance
+    return replace(sub_min, theta=theta, covariance=covariance)
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,18 @@
 """Sensor models: image coordinates of ground points, with partials."""
 
+from collections.abc import Iterable
+
 from submin.errors import InputError
-from submin.sensors.base import Ground, Projection, Sensor
+from submin.sensors.base import Ground, Parameter, Projection, Sensor
 from submin.sensors.rpc import RpcSensor
 from submin.sensors.survey import SurveySensor
 
 SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in (RpcSensor(), SurveySensor())}
 
-WIDEST = max(len(sensor.parameters) for sensor in SENSORS.values())
-"""Adjustable parameters of the sensor that has most of them; images of the others are padded with parameters of zero partial."""
+
+def width_of(sensors: Iterable[str]) -> int:
+    """Adjustable parameters of the one of these sensors that has most; images of the others are padded with parameters of zero partial."""
+    return max((len(sensor_named(name).parameters) for name in sensors), default=0)
 
 
 def sensor_named(name: str) -> Sensor:
@@ -19,4 +23,4 @@ def sensor_named(name: str) -> Sensor:
         raise InputError(f"sensor is {name!r}; expected one of {', '.join(sorted(SENSORS))}") from None
 
 
-__all__ = ["SENSORS", "WIDEST", "Ground", "Projection", "Sensor", "sensor_named"]
+__all__ = ["SENSORS", "Ground", "Parameter", "Projection", "Sensor", "sensor_named", "width_of"]

@@ -57,31 +57,50 @@ class Projection:
     by_parameters: Array
 
 
+@dataclass(frozen=True)
+class Parameter:
+    """One adjustable parameter of an image: a correction that is zero for the unadjusted camera.
+
+    Attributes
+    ----------
+    name : for people, and for priors: "sample bias", "position in track"
+    unit : "px", "m", "rad"
+    group : parameters of a kind, which priors may name together: "bias", "position", "attitude"
+    sigma : a priori, in its unit, where the priors of a block say nothing
+    shared : True when the images of a pass can share an error in it
+    """
+
+    name: str
+    unit: str
+    group: str
+    sigma: float
+    shared: bool = False
+
+
 class Sensor(Protocol):
     """A sensor model. ``name`` is the word in the column ``sensor`` of a catalogue."""
 
     name: str
     unit: str
     """In which image coordinates are measured: ``pixel`` or ``metre``."""
-    parameters: tuple[str, ...]
-    """What each adjustable parameter of an image is, for people."""
-    bias: tuple[int, ...]
-    """Places of the parameters that shift the whole image in sample and line: the ones that images of a pass can share."""
+    parameters: tuple[Parameter, ...]
+    """The adjustable parameters of an image."""
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
         """Row of numbers that describes one camera, from its catalogue description; raises `InputError` when it is incomplete."""
         ...
 
     def project(self, cameras: Array, parameters: Array, ground: Ground, image: Index, point: Index, at: Array | None = None) -> Projection:
-        """Project ray r: point ``point[r]`` into image ``image[r]``.
+        """Project ray r: point ``point[r]`` into image ``image[r]``; NaN where the camera does not see the point.
 
         A correction that varies over the image is evaluated at the image coordinates ``at`` (r, 2), by default at the predicted ones.
 
-        ``cameras`` (m, c) holds packed cameras, ``parameters`` (m, p) the corrections of the images' adjustable parameters.
+        ``cameras`` (m, c) holds packed cameras, ``parameters`` (m, p) the corrections of the images' adjustable parameters: those of the
+        sensor first, and perhaps more columns, which are not its own.
         """
         ...
 
-    def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array) -> Array:
+    def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
         """Longitude, latitude (degrees) and height (r, 3) of image coordinates at given ellipsoidal heights, unadjusted cameras.
 
         A place that cannot be reached (camera looking away from it) comes back as NaN.

@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.errors import InputError
-from submin.sensors.base import Array, Ground, Index, Projection
+from submin.geodesy import Ellipsoid
+from submin.sensors.base import Array, Ground, Index, Parameter, Projection
 
 SCALARS = (
     "LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF",
@@ -153,11 +154,15 @@ class RpcSensor:
 
     name = "rpc"
     unit = "pixel"
-    parameters: tuple[str, ...] = (
-        "sample bias", "sample drift along samples", "sample drift along lines",
-        "line bias", "line drift along samples", "line drift along lines",
-    )  # fmt: skip
-    bias: tuple[int, ...] = (0, 3)
+    parameters: tuple[Parameter, ...] = tuple(
+        Parameter(f"{axis} {name}", "px", group, sigma, shared)
+        for axis in ("sample", "line")
+        for name, group, sigma, shared in (
+            ("bias", "bias", 10.0, True),
+            ("drift along samples", "drift along samples", 1.0, False),
+            ("drift along lines", "drift along lines", 1.0, False),
+        )
+    )
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
         """Packed camera (94,) of a description: GDAL's RPC names, and ``origin``, the (sample, line) of the image's first pixel.
@@ -194,7 +199,7 @@ class RpcSensor:
         where = np.empty((0, 2)) if at is None else at
         return Projection(*_project(cameras, parameters, ground.geodetic, ground.jacobian, image, point, where))
 
-    def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array) -> Array:
+    def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
         """See `Sensor.localise`."""
         return np.asarray(_localise(cameras, image, samples, lines, heights))
 

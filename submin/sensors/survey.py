@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.errors import InputError
-from submin.sensors.base import Ground, Projection
+from submin.geodesy import Ellipsoid
+from submin.sensors.base import Ground, Parameter, Projection
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -31,8 +32,7 @@ class SurveySensor:
 
     name = "survey"
     unit = "metre"
-    parameters: tuple[str, ...] = ()
-    bias: tuple[int, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
         """See `Sensor.pack`."""
@@ -50,7 +50,7 @@ class SurveySensor:
         along = np.einsum("rck,rk->rc", axes, ground.geocentric[point] - cameras[image, _ORIGIN])
         return Projection(along, axes, np.zeros((len(image), 2, 0)))
 
-    def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array) -> Array:
+    def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
         """The surveyed place of each view, whatever the height."""
         return np.asarray(cameras[image, _PLACE])
 

@@ -22,13 +22,13 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from submin.adjustment.priors import APriori, ImagePrior, prior_factor
 from submin.errors import InputError
 from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
 from submin.sensors import Ground, sensor_named
+from submin.sensors.footprint import footprints
 from submin.simulation.rpc_fit import fit_rpc
 
 Array = NDArray[np.float64]
@@ -36,6 +36,7 @@ Index = NDArray[np.int32]
 Ids = NDArray[np.str_]
 
 SENSOR = sensor_named("rpc")
+BIAS = [c for c, parameter in enumerate(SENSOR.parameters) if parameter.group == "bias"]
 GRAVITY_PARAMETER = 3.986004418e14
 """GM of the Earth, m3/s2 (NIMA TR8350.2): it only sets the times between images."""
 FIRST_PASS = datetime.datetime(2012, 2, 1, 3, 30, tzinfo=datetime.UTC)
@@ -384,7 +385,7 @@ def packed_cameras(images: Sequence[SimulatedImage]) -> Array:
 
 def image_priors(images: Sequence[SimulatedImage], a_priori: APriori) -> list[ImagePrior]:
     """What the a priori factor needs of the images, for `submin.adjustment.priors.prior_factor`."""
-    return [ImagePrior(i.block_id, i.pass_id, i.seconds, a_priori, SENSOR.bias) for i in images]
+    return [ImagePrior(i.block_id, i.pass_id, i.seconds, a_priori, SENSOR.parameters) for i in images]
 
 
 def terrain_height(along_km: Array, across_km: Array, relief_m: float) -> Array:
@@ -424,6 +425,9 @@ def _triplet(design: RegionDesign, frame: RegionFrame, scene: _Scene) -> list[Si
             (float(low[1]), float(high[1])),
             (-0.1 * design.relief_m, 1.1 * design.relief_m),
         )
+        size, height = np.array([[camera.width, lines]], dtype=np.float64), np.array([0.5 * design.relief_m])
+        packed = SENSOR.pack(rpc, camera.width, lines)[None]
+        (footprint,) = footprints(SENSOR, packed, np.zeros((1, 2)), size, height, frame.ellipsoid)
         images.append(
             SimulatedImage(
                 image_id=f"{block}-{view.name}",
@@ -435,7 +439,7 @@ def _triplet(design: RegionDesign, frame: RegionFrame, scene: _Scene) -> list[Si
                 width=camera.width,
                 height=lines,
                 acquired=_acquired(scene.strip, camera.first_angle + 0.5 * (lines - 1) * camera.line_angle, camera.orbit_radius),
-                footprint=_footprint(SENSOR.pack(rpc, camera.width, lines), camera.width, lines, 0.5 * design.relief_m),
+                footprint=footprint,
             )
         )
     return images
@@ -465,14 +469,6 @@ def _acquired(strip: int, angle: float, orbit_radius: float) -> str:
     return time.replace(tzinfo=None).isoformat(timespec="milliseconds") + "Z"
 
 
-def _footprint(camera: Array, width: int, lines: int, height: float) -> bytes:
-    """WKB of the ground outline, corners and middles of the edges, at one height."""
-    samples = (width - 1) * np.array([0.0, 0.5, 1.0, 1.0, 1.0, 0.5, 0.0, 0.0])
-    rows = (lines - 1) * np.array([0.0, 0.0, 0.0, 0.5, 1.0, 1.0, 1.0, 0.5])
-    ground = SENSOR.localise(camera[None], np.zeros(8, dtype=np.int32), samples, rows, np.full(8, height))
-    return bytes(shapely.to_wkb(shapely.Polygon(ground[:, :2])))
-
-
 def _tie_points(design: RegionDesign, rng: np.random.Generator) -> tuple[Ids, Array, Array, Array]:
     """Ids, places along and across (km), and true geodetic coordinates (n, 3) of a jittered grid that fills the region."""
     rows = max(1, round(design.height_km / design.point_spacing_km))
@@ -492,7 +488,7 @@ def _true_parameters(design: RegionDesign, images: Sequence[SimulatedImage], rng
     bad = np.sort(rng.choice(len(images), design.bad_cameras, replace=False)).astype(np.int32)
     direction = rng.uniform(0.0, 2.0 * np.pi, design.bad_cameras)
     shift = design.bad_camera_sigmas * design.priors.bias_px * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    theta[bad[:, None], list(SENSOR.bias)] += shift
+    theta[bad[:, None], BIAS] += shift
     return theta, bad
 
 

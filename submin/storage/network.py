@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.errors import QueryError
-from submin.network.cell import Cell
+from submin.network.cell import Cell, widened_sums
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import SubMin
 from submin.query.control_set import ControlSet
@@ -153,7 +153,8 @@ class Network:
         """A cell's images and sums."""
         group = group_of(self._snapshot.root, "cells/" + self.cover.cell_name(number))
         parts = read_record(group, ["images", "vector", "information"])
-        return parts["images"].astype(np.int32), read_sums_of(group, parts)
+        images = parts["images"].astype(np.int32)
+        return images, widened_sums(read_sums_of(group, parts), len(images), self._snapshot.metadata.parameters)
 
     def sub_min(self, tile: int, images: Index | None) -> SubMin:
         """A tile's sub-MIN, or its marginal on some images."""

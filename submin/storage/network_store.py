@@ -180,11 +180,12 @@ def tag_version(place: str, tag: str, name: str | None = None) -> Version:
 class Snapshot:
     """One version of a network, read only. Everything is read when asked for; nothing is kept but small tables."""
 
-    def __init__(self, root: zarr.Group, place: str, cover: Cover | None = None) -> None:
-        """``cover`` is that of the version being made, where it has finer tiles than the one in the store."""
+    def __init__(self, root: zarr.Group, place: str, cover: Cover | None = None, parameters: int = 0) -> None:
+        """``cover`` and ``parameters`` are those of the version being made: its tiles may be finer, its images may need more parameters."""
         self.root = root
         self.place = place
-        self.metadata = NetworkMetadata.from_attributes(attributes_of(root), place)
+        stored = NetworkMetadata.from_attributes(attributes_of(root), place)
+        self.metadata = replace(stored, parameters=max(stored.parameters, parameters))
         self.cover = Cover.from_mapping(self.metadata.cover) if cover is None else cover
         self.number = int(attributes_of(root)["version"])
 
@@ -217,7 +218,7 @@ class Snapshot:
         name = "cells/" + self.cover.cell_name(number)
         if name not in self.root:
             return empty_cell(number, self.metadata.parameters)
-        return read_cell(group_of(self.root, name), with_sums=with_sums)
+        return read_cell(group_of(self.root, name), self.metadata.parameters, with_sums=with_sums)
 
     def cell_numbers(self) -> tuple[int, ...]:
         """Cells that hold points or rays, ascending."""
@@ -233,7 +234,7 @@ class Snapshot:
 
     def sub_min(self, tile: int, images: NDArray[np.int32] | None = None) -> SubMin:
         """A tile's sub-MIN, or its marginal on some images."""
-        return read_sub_min(group_of(self.root, "tiles/" + self.cover.tile_name(tile)), images)
+        return read_sub_min(group_of(self.root, "tiles/" + self.cover.tile_name(tile)), self.metadata.parameters, images)
 
     def tile_images(self, tile: int) -> NDArray[np.int32]:
         """Rows of the images that a tile sees."""

@@ -16,13 +16,14 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import shapely
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
 from submin.formats.columns import integer, number, read_table, text
 from submin.formats.rpc_files import read_rpc
+from submin.geodesy import WGS84
 from submin.sensors import sensor_named
+from submin.sensors.footprint import footprints
 from submin.storage.catalogue_schema import (
     DEFAULT_SIGMA_PX,
     Array,
@@ -326,14 +327,7 @@ def _footprints(records: Sequence[ImageRecord]) -> list[bytes]:
     cameras = np.stack([record.pack() for record in records])
     first = np.array([json.loads(record.camera)["origin"] for record in records])
     size = np.array([(record.width, record.height) for record in records], dtype=np.float64)
-    corners = first[:, None] - 0.5 + size[:, None] * np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    image = np.repeat(np.arange(len(records), dtype=np.int32), 4)
-    heights = sensor.mean_height(cameras)[image]
-    samples, lines = corners[..., 0].ravel(), corners[..., 1].ravel()
-    ground = sensor.localise(cameras, image, samples, lines, heights)[:, :2].reshape(-1, 4, 2)
-    reached = np.asarray(np.isfinite(ground).all(axis=(1, 2)))
-    polygons = iter(shapely.to_wkb(shapely.polygons(ground[reached])))
-    return [next(polygons) if r else b"" for r in reached]
+    return footprints(sensor, cameras, first, size, sensor.mean_height(cameras), WGS84)
 
 
 def _members(records: Sequence[ImageRecord]) -> dict[str, list[int]]:

@@ -15,9 +15,9 @@ from submin.adjustment.estimation import fill_symmetric
 from submin.adjustment.rays import Rays
 from submin.errors import StoreError
 from submin.geodesy import Ellipsoid
-from submin.network.cell import Cell
+from submin.network.cell import Cell, widened
 from submin.network.network_image import NetworkImage
-from submin.network.sub_min import SubMin
+from submin.network.sub_min import SubMin, wider
 from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
@@ -48,7 +48,7 @@ class NetworkMetadata:
     semimajor_axis, flattening : ellipsoid (metres)
     cover : description of the cover, see `Cover.to_mapping`
     form : ``factored``
-    parameters : adjustable parameters kept for each image
+    parameters : adjustable parameters kept for each image; later versions may keep more, when a sensor comes that has them
     max_parameters : a tile that would hold more image parameters is split, where its overlap lets it
     format_version : of the store
     """
@@ -125,8 +125,8 @@ def determined(cell: Cell) -> NDArray[np.bool_]:
     return np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell.point_ids)) >= 2
 
 
-def read_cell(group: zarr.Group, *, with_sums: bool = True) -> Cell:
-    """The cell of a record; without sums (left empty) the large part is not read."""
+def read_cell(group: zarr.Group, parameters: int, *, with_sums: bool = True) -> Cell:
+    """The cell of a record, with so many parameters an image; without sums (left empty) the large part is not read."""
     wanted = [
         "point_ids", "ray_point", "ray_image", "accepted", "images", "origin", "linearised_at", "theta", "observed", "sigma",
     ]  # fmt: skip
@@ -136,10 +136,11 @@ def read_cell(group: zarr.Group, *, with_sums: bool = True) -> Cell:
         parts["accepted"].astype(np.bool_),
     )  # fmt: skip
     sums = read_sums_of(group, parts) if with_sums else Sums(np.empty((0, 0)), np.empty(0), 0.0, 0)
-    return Cell(
+    cell = Cell(
         int(attributes_of(group)["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"],
         parts["images"].astype(np.int32), parts["theta"], rays, sums,
     )  # fmt: skip
+    return widened(cell, parameters)
 
 
 def read_sums_of(group: zarr.Group, parts: dict[str, NDArray[Any]]) -> Sums:
@@ -162,8 +163,11 @@ def write_sub_min(root: zarr.Group, name: str, sub_min: SubMin, cells: Sequence[
         array[start : start + chunk, : start + chunk] = sub_min.covariance[start : start + chunk, : start + chunk]
 
 
-def read_sub_min(group: zarr.Group, images: NDArray[np.int32] | None = None) -> SubMin:
-    """A tile's sub-MIN; with ``images`` (rows of the network, ascending) its marginal on those of them that it holds."""
+def read_sub_min(group: zarr.Group, parameters: int, images: NDArray[np.int32] | None = None) -> SubMin:
+    """A tile's sub-MIN, with so many parameters an image.
+
+    With ``images`` (rows of the network, ascending) its marginal on those of them that it holds.
+    """
     parts = read_record(group, ["images", "theta"])
     held, theta = parts["images"].astype(np.int32), parts["theta"]
     chosen = np.arange(len(held)) if images is None else np.flatnonzero(np.isin(held, images))
@@ -172,10 +176,11 @@ def read_sub_min(group: zarr.Group, images: NDArray[np.int32] | None = None) -> 
     array = array_of(group, "covariance")
     covariance = np.asarray(array[:, :] if len(chosen) == len(held) else array.oindex[rows, rows])
     attributes = attributes_of(group)
-    return SubMin(
+    sub_min = SubMin(
         held[chosen], theta[chosen], fill_symmetric(np.ascontiguousarray(covariance)),
         float(attributes["chi_square"]), int(attributes["redundancy"]),
     )  # fmt: skip
+    return wider(sub_min, parameters)
 
 
 def image_columns(images: Sequence[NetworkImage], records: Sequence[ImageRecord]) -> dict[str, NDArray[Any]]:

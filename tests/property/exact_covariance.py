@@ -142,7 +142,7 @@ def a_priori_factor(images: Sequence[NetworkImage]) -> Array:
     A survey has nothing to adjust, and a withdrawn image is not there: their rows are zero.
     """
     m, p = len(images), len(sensor_named("rpc").parameters)
-    bias = np.isin(np.arange(p), sensor_named("rpc").bias)
+    bias = np.isin(np.arange(p), (0, 3))
     models = [json.loads(image.a_priori) if image.a_priori else None for image in images]
     passes = list(dict.fromkeys(image.pass_id for image in images))
     factor = np.zeros((m, p, m * p + 2 * len(passes)))

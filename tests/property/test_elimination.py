@@ -27,8 +27,10 @@ from submin.adjustment.elimination import (
 from submin.adjustment.estimation import ImageEstimate, cholesky, estimate_images, fill_symmetric, prior_variance, reduced_information
 from submin.adjustment.priors import APriori, ImagePrior, prior_factor
 from submin.errors import NumericalError
+from submin.sensors import sensor_named
 
 Array = NDArray[np.float64]
+RPC = sensor_named("rpc")
 
 P = 6
 PIXELS_PER_METRE = 2.0
@@ -78,7 +80,7 @@ def random_network(seed: int, points: int = 14, images: int = 5, *, rejected: fl
     by_parameters += 0.01 * rng.normal(size=by_parameters.shape)
     sigma = rng.uniform(0.3, 1.0, (rays, 2))
     model = APriori(10.0, 1.0, 0.4, "exponential", 30.0)
-    priors = [ImagePrior(f"b{i // 2}", f"p{i % 2}", 10.0 * i, model, (0, 3)) for i in range(images)]
+    priors = [ImagePrior(f"b{i // 2}", f"p{i % 2}", 10.0 * i, model, RPC.parameters) for i in range(images)]
     linear = LinearRays(
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), image, camera_rows(rng, rays) / sigma[:, :, None],
         by_parameters / sigma[:, :, None], rng.normal(0.0, 20.0, (rays, 2)),
@@ -342,7 +344,7 @@ def weak_network(angle: float) -> Network:
         by_parameters[:, :, c, 3 * c] = 1.0
         place = rng.uniform(-1.0, 1.0, (points, 1, 2)) + 0.1 * rng.uniform(-1.0, 1.0, (points, 2, 2))
         by_parameters[:, :, c, 3 * c + 1 : 3 * c + 3] = place
-    priors = [ImagePrior(f"b{i}", f"p{i}", 0.0, APriori(10.0, 1.0, 0.0), (0, 3)) for i in range(images)]
+    priors = [ImagePrior(f"b{i}", f"p{i}", 0.0, APriori(10.0, 1.0, 0.0), RPC.parameters) for i in range(images)]
     linear = LinearRays(
         np.arange(0, 2 * points + 1, 2), np.tile(np.arange(2, dtype=np.int32), points), by_ground.reshape(-1, 2, 3),
         by_parameters.reshape(-1, 2, P), np.zeros((2 * points, 2)),

@@ -16,8 +16,10 @@ from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori, ImagePrior, prior_factor
 from submin.network import sub_min as module
 from submin.network.sub_min import GroundPart, SubMin, add_sums, factor, joint_covariance, loadings, locate, point_covariances
+from submin.sensors import sensor_named
 
 Array = NDArray[np.float64]
+RPC = sensor_named("rpc")
 Index = NDArray[np.int32]
 
 P = 6
@@ -61,8 +63,8 @@ def random_rays(seed: int, points: int = 15, images: int = 6) -> RayTable:
 
 def image_set(rows: Index) -> ImageSet:
     """Images of these rows of the network: blocks of two, passes across blocks, correlated in time. Their cameras do not matter here."""
-    priors = tuple(ImagePrior(f"b{i // 2}", f"p{i % 3}", 11.0 * i, APriori(10.0, 1.0, 0.4, "gaussian", 20.0), (0, 3)) for i in rows)
-    return ImageSet(tuple(f"image {i}" for i in rows), ("rpc",) * len(rows), np.full((len(rows), 94), np.nan), priors)
+    priors = tuple(ImagePrior(f"b{i // 2}", f"p{i % 3}", 11.0 * i, APriori(10.0, 1.0, 0.4, "gaussian", 20.0), RPC.parameters) for i in rows)
+    return ImageSet(tuple(f"image {i}" for i in rows), ("rpc",) * len(rows), np.full((len(rows), 94), np.nan), priors, P)
 
 
 def part_of(rays: RayTable, chosen: NDArray[np.bool_]) -> tuple[tuple[Index, Sums], GroundPart]:

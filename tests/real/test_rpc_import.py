@@ -15,6 +15,7 @@ import shapely
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
+from submin.geodesy import WGS84
 from submin.sensors import sensor_named
 from submin.storage.catalogue import Block, Catalogue, defects
 from submin.storage.rpc_import import ImportSummary, import_rpc
@@ -93,7 +94,7 @@ def rays_miss_m(block: Block, height: float) -> float:
     """Median distance in metres between the places of two rays of one point, unadjusted cameras, at one height above the ellipsoid."""
     sensor = sensor_named("rpc")
     cameras = np.stack([image.pack() for image in block.images])
-    ground = sensor.localise(cameras, block.image, block.sample, block.line, np.full(len(block), height))
+    ground = sensor.localise(cameras, block.image, block.sample, block.line, np.full(len(block), height), WGS84)
     order = np.argsort(block.point_ids, kind="stable")
     ids, ground = block.point_ids[order], ground[order]
     metres = np.diff(ground[:, :2], axis=0)[ids[1:] == ids[:-1]] * 111e3
@@ -122,7 +123,7 @@ def test_footprints_cover_the_tie_points(data: Path, tmp_path: Path, name: str) 
     block = next(Catalogue.open(tmp_path / "c").blocks())
     sensor = sensor_named("rpc")
     cameras = np.stack([image.pack() for image in block.images])
-    ground = sensor.localise(cameras, block.image, block.sample, block.line, sensor.mean_height(cameras)[block.image])
+    ground = sensor.localise(cameras, block.image, block.sample, block.line, sensor.mean_height(cameras)[block.image], WGS84)
     footprints = shapely.from_wkb([image.footprint for image in block.images])
     inside = shapely.contains_xy(footprints[block.image], ground[:, 0], ground[:, 1])
     assert inside.all()

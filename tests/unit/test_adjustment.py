@@ -52,8 +52,8 @@ def camera(tangent_east: float, tangent_north: float) -> dict[str, Any]:
 def image_set(views: tuple[tuple[float, float], ...] = TRIPLET, a_priori: APriori = APriori(10.0, 1.0, 0.5)) -> ImageSet:  # noqa: B008
     sensor = sensor_named("rpc")
     cameras = np.stack([sensor.pack(camera(*view), WIDTH, HEIGHT) for view in views])
-    priors = tuple(ImagePrior("block", "pass", 30.0 * i, a_priori, sensor.bias) for i in range(len(views)))
-    return ImageSet(tuple(f"image {i}" for i in range(len(views))), ("rpc",) * len(views), cameras, priors)
+    priors = tuple(ImagePrior("block", "pass", 30.0 * i, a_priori, sensor.parameters) for i in range(len(views)))
+    return ImageSet(tuple(f"image {i}" for i in range(len(views))), ("rpc",) * len(views), cameras, priors, len(sensor.parameters))
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,10 @@ from submin.adjustment.blunders import (
 from submin.adjustment.elimination import LinearRays, eliminate
 from submin.adjustment.estimation import ImageEstimate, estimate_images, prior_variance
 from submin.adjustment.priors import APriori, ImagePrior, prior_factor
+from submin.sensors import sensor_named
 
 Array = NDArray[np.float64]
+RPC = sensor_named("rpc")
 
 P = 6
 
@@ -74,7 +76,7 @@ def simulate(seed: int, counts: NDArray[np.int64], images: int = 6, theta: Array
     for c in range(2):
         by_parameters[:, c, 3 * c] = 2.0
         by_parameters[:, c, 3 * c + 1 : 3 * c + 3] = 2.0 * (place + 0.1 * rng.normal(size=(rays, 2)))
-    priors = tuple(ImagePrior(f"b{i}", f"p{i}", 0.0, APriori(10.0, 1.0, 0.0), (0, 3)) for i in range(images))
+    priors = tuple(ImagePrior(f"b{i}", f"p{i}", 0.0, APriori(10.0, 1.0, 0.0), RPC.parameters) for i in range(images))
     factor = prior_factor(priors, P)
     if theta is None:
         theta = np.asarray(factor @ rng.normal(size=factor.shape[1])).reshape(images, P)

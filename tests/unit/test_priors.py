@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from submin.adjustment.priors import RELEASE_FACTOR, APriori, ImagePrior, correlation_factor, prior_factor
 from submin.errors import InputError
+from submin.sensors import sensor_named
 
 Array = NDArray[np.float64]
+RPC = sensor_named("rpc")
 
 P, BIAS = 6, (0, 3)
 MODELS = (
@@ -29,7 +31,7 @@ MODELS = (
 def images(blocks: int = 3, each: int = 3, model: APriori | None = None) -> list[ImagePrior]:
     """Images of several blocks over two passes, the blocks' models all different unless one is given."""
     return [
-        ImagePrior(f"block {b}", f"pass {(b + k) % 2}", 100.0 * b + 7.0 * k, model or MODELS[b % len(MODELS)], BIAS)
+        ImagePrior(f"block {b}", f"pass {(b + k) % 2}", 100.0 * b + 7.0 * k, model or MODELS[b % len(MODELS)], RPC.parameters)
         for b in range(blocks)
         for k in range(each)
     ]
@@ -79,7 +81,7 @@ def assert_equal_covariances(found: Array, expected: Array, relative: float = 1e
 
 
 def test_one_image_has_the_sigmas_that_were_given() -> None:
-    found = covariance([ImagePrior("b", "p", 0.0, APriori(10.0, 1.0, 0.36), BIAS)])
+    found = covariance([ImagePrior("b", "p", 0.0, APriori(10.0, 1.0, 0.36), RPC.parameters)])
     np.testing.assert_allclose(found, np.diag([100.0, 1.0, 1.0, 100.0, 1.0, 1.0]), rtol=1e-14, atol=1e-14)
 
 
@@ -116,9 +118,9 @@ def test_subset_of_images_has_the_marginal_of_the_whole(seed: int, count: int) -
 
 def test_images_seconds_apart_keep_their_covariance() -> None:
     model = APriori(10.0, 1.0, 0.5, "gaussian", 5000.0)
-    priors = [ImagePrior("b", f"pass {k}", 5.0 * k, model, BIAS) for k in range(6)]
+    priors = [ImagePrior("b", f"pass {k}", 5.0 * k, model, RPC.parameters) for k in range(6)]
     # so close to singular that round-off makes a computed eigenvalue negative: a plain Cholesky factor does not exist
-    correlation = model.correlations(np.arange(0.0, 30.0, 5.0))
+    correlation = model.of(RPC.parameters[0]).correlations(np.arange(0.0, 30.0, 5.0))
     assert np.linalg.eigvalsh(correlation).min() < 0.0
     factor = correlation_factor(correlation)
     assert np.isfinite(factor).all()
@@ -129,7 +131,7 @@ def test_images_seconds_apart_keep_their_covariance() -> None:
 
 def test_nearly_equal_images_differ_as_much_as_the_model_says() -> None:
     model = APriori(10.0, 1.0, 0.0, "gaussian", 5000.0)
-    priors = [ImagePrior("b", "p", 5.0 * k, model, BIAS) for k in range(6)]
+    priors = [ImagePrior("b", "p", 5.0 * k, model, RPC.parameters) for k in range(6)]
     by_image = prior_factor(priors, P).toarray().reshape(6, P, -1)[:, 0]
     for i in range(6):
         for k in range(i):
@@ -214,9 +216,9 @@ def test_bad_models_are_refused(values: dict[str, Any], words: str) -> None:
 def test_correlation_in_time_needs_times(correlation: str) -> None:
     model = APriori(correlation=correlation, correlation_parameter=5.0)
     with pytest.raises(InputError, match=r"temporal correlation needs the time of every image .*acquired"):
-        prior_factor([ImagePrior("b", "p", seconds, model, BIAS) for seconds in (0.0, np.nan)], P)
+        prior_factor([ImagePrior("b", "p", seconds, model, RPC.parameters) for seconds in (0.0, np.nan)], P)
 
 
 def test_times_may_be_unknown_where_they_are_not_needed() -> None:
-    priors = [ImagePrior("b", "p", np.nan, APriori(10.0, 1.0, 0.0, "fixed", 0.4), BIAS) for _ in range(2)]
+    priors = [ImagePrior("b", "p", np.nan, APriori(10.0, 1.0, 0.0, "fixed", 0.4), RPC.parameters) for _ in range(2)]
     assert_equal_covariances(covariance(priors), covariance_by_hand(priors))

@@ -66,8 +66,8 @@ def camera(tangent_east: float, tangent_north: float) -> dict[str, Any]:
 def image_set(views: Sequence[tuple[float, float]] = VIEWS, names: Sequence[str] = NAMES) -> ImageSet:
     sensor = sensor_named("rpc")
     cameras = np.stack([sensor.pack(camera(*view), 10000.0, 10000.0) for view in views])
-    priors = tuple(ImagePrior(f"b{i}", f"p{i}", 0.0, APriori(), sensor.bias) for i in range(len(views)))
-    return ImageSet(tuple(names[: len(views)]), ("rpc",) * len(views), cameras, priors, COVER.ellipsoid)
+    priors = tuple(ImagePrior(f"b{i}", f"p{i}", 0.0, APriori(), sensor.parameters) for i in range(len(views)))
+    return ImageSet(tuple(names[: len(views)]), ("rpc",) * len(views), cameras, priors, len(sensor.parameters), COVER.ellipsoid)
 
 
 IMAGES = image_set()

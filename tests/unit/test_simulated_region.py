@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from submin.adjustment.priors import APriori
 from submin.errors import InputError
-from submin.geodesy import geocentric_to_geodetic, geodetic_to_geocentric
+from submin.geodesy import WGS84, geocentric_to_geodetic, geodetic_to_geocentric
 from submin.sensors import Ground, sensor_named
 from submin.simulation.region import LinearArrayCamera, RegionDesign, RegionFrame, SimulatedRegion, simulate_region, terrain_height
 from submin.storage.catalogue import Catalogue, defects
@@ -100,15 +100,15 @@ def test_views_pixels_and_times_are_those_of_zy3(small: SimulatedRegion) -> None
     size = np.array([[i.width, i.height] for i in small.images[:3]])
     image = np.arange(3, dtype=np.int32)
     centre = 0.5 * (size - 1.0)
-    at = geodetic_to_geocentric(sensor.localise(cameras, image, centre[:, 0], centre[:, 1], np.full(3, 1000.0)))
+    at = geodetic_to_geocentric(sensor.localise(cameras, image, centre[:, 0], centre[:, 1], np.full(3, 1000.0), WGS84))
     assert np.abs(at - at.mean(axis=0)).max() < 1.0, "the three images of a triplet share their centre"
-    raised = geodetic_to_geocentric(sensor.localise(cameras, image, centre[:, 0], centre[:, 1], np.full(3, 2000.0)))
+    raised = geodetic_to_geocentric(sensor.localise(cameras, image, centre[:, 0], centre[:, 1], np.full(3, 2000.0), WGS84))
     tilt = np.degrees(np.arccos((raised - at) @ (at.mean(axis=0) / np.linalg.norm(at.mean(axis=0))) / np.linalg.norm(raised - at, axis=1)))
     np.testing.assert_allclose(tilt, [23.9, 0.0, 23.9], atol=0.4)
     np.testing.assert_allclose(np.degrees(np.arccos(_cosine(raised[0] - at[0], raised[2] - at[2]))), 47.7, atol=0.5)
     for step in ([1.0, 0.0], [0.0, 1.0]):
         beside = centre + step
-        moved = geodetic_to_geocentric(sensor.localise(cameras, image, beside[:, 0], beside[:, 1], np.full(3, 1000.0)))
+        moved = geodetic_to_geocentric(sensor.localise(cameras, image, beside[:, 0], beside[:, 1], np.full(3, 1000.0), WGS84))
         np.testing.assert_allclose(np.linalg.norm(moved - at, axis=1), [3.5, 2.1, 3.5], rtol=0.01)
     forward, nadir, backward = (i.seconds for i in small.images[:3])
     assert 20.0 < nadir - forward < 40.0 and 20.0 < backward - nadir < 40.0
