@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 
@@ -12,6 +13,9 @@ from submin.storage.arrays import append_table
 from submin.storage.catalogue_schema import Block, defects
 from submin.storage.control_blocks import control_point_of
 from submin.storage.network_store import Snapshot
+
+
+_MEASURED = re.compile(r"\d+\.\d+")
 
 
 @dataclass(frozen=True)
@@ -103,8 +107,8 @@ class Ledger:
         self.block_of_image.update((image.image_id, block.block_id) for image in block.images)
 
     def said(self, block_id: str, reason: str) -> bool:
-        """True when the last line of a block is a rejection for the same reason."""
-        return self.rejections.get(block_id) == reason
+        """True when the last line of a block is a rejection for the same reason; a measured value in it may be another by now."""
+        return _MEASURED.sub("", self.rejections.get(block_id, "")) == _MEASURED.sub("", reason)
 
     def fused(self) -> tuple[Entry, ...]:
         """Blocks of images that are in the network."""

@@ -133,7 +133,9 @@ def test_the_block_in_error_is_rejected_and_none_that_comes_after_it(
     assert f"point {shared} is measured" in result.rejected[0].reason
     version = Snapshot.open(str(network)).number
     again = fuse(mixed, network, area_of(region), batch_blocks=batch_blocks)
-    assert (again.fused, again.skipped, again.rejected) == (0, 2, result.rejected)
+    # the later block's rays have moved the place that it is compared with, by little; that is no news for the ledger
+    assert (again.fused, again.skipped, [r.block_id for r in again.rejected]) == (0, 2, [stranger.block_id])
+    assert f"point {shared} is measured" in again.rejected[0].reason
     assert Snapshot.open(str(network)).number == version
 
 
