@@ -14,7 +14,6 @@ from submin.storage.catalogue_schema import Block, defects
 from submin.storage.control_blocks import control_point_of
 from submin.storage.network_store import Snapshot
 
-
 _MEASURED = re.compile(r"\d+\.\d+")
 
 
