@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numba
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
@@ -80,17 +81,47 @@ def geodetic_to_geocentric(geodetic: Array, ellipsoid: Ellipsoid = WGS84) -> Arr
 
 
 def geocentric_to_geodetic(geocentric: Array, ellipsoid: Ellipsoid = WGS84) -> Array:
-    """Geodetic coordinates (n, 3) in degrees, degrees, metres of geocentric ones (n, 3) in metres.
+    """Geodetic coordinates (n, 3) in degrees, degrees, metres of geocentric ones (n, 3) in metres."""
+    return geodetic_with_jacobian(geocentric, ellipsoid)[0]
 
-    One Newton step on PROJ's closed form brings the round trip from a micrometre to the spacing of float64 (a few nanometres).
+
+def geodetic_with_jacobian(geocentric: Array, ellipsoid: Ellipsoid = WGS84) -> tuple[Array, Array]:
+    """Geodetic coordinates (n, 3) of geocentric ones (n, 3), and their partials (n, 3, 3) by geocentric metres.
+
+    The radii of curvature are those of the meridian and the prime vertical at each point. One Newton step on PROJ's closed form brings
+    the round trip from a micrometre to the spacing of float64 (a few nanometres).
     """
-    x = np.asarray(geocentric, dtype=np.float64)
+    x = np.ascontiguousarray(geocentric, dtype=np.float64)
     lon, lat, height = _cartesian(ellipsoid).transform(
         x[:, 0], x[:, 1], x[:, 2], direction=pyproj.enums.TransformDirection.INVERSE, radians=True
     )
-    geodetic = np.stack([np.degrees(lon), np.degrees(lat), height], axis=1)
-    misclosure = x - geodetic_to_geocentric(geodetic, ellipsoid)
-    return np.asarray(geodetic + np.einsum("nij,nj->ni", geodetic_jacobian(geodetic, ellipsoid), misclosure))
+    return _refined(x, lon, lat, height, ellipsoid.semimajor_axis, ellipsoid.eccentricity_squared)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _refined(geocentric: Array, longitude: Array, latitude: Array, heights: Array, a: float, e2: float) -> tuple[Array, Array]:
+    """Approximate geodetic coordinates (radians) one Newton step better, in degrees, and their partials by geocentric metres."""
+    n, degree = len(geocentric), np.pi / 180.0
+    geodetic, jacobian = np.empty((n, 3)), np.empty((n, 3, 3))
+    for j in range(n):
+        sin_lon, cos_lon, sin_lat, cos_lat = np.sin(longitude[j]), np.cos(longitude[j]), np.sin(latitude[j]), np.cos(latitude[j])
+        height, root = heights[j], np.sqrt(1.0 - e2 * sin_lat * sin_lat)
+        vertical = a / root
+        meridian = vertical * (1.0 - e2) / (root * root)
+        axes = jacobian[j]
+        axes[0, 0], axes[0, 1], axes[0, 2] = -sin_lon, cos_lon, 0.0
+        axes[1, 0], axes[1, 1], axes[1, 2] = -sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat
+        axes[2, 0], axes[2, 1], axes[2, 2] = cos_lat * cos_lon, cos_lat * sin_lon, sin_lat
+        for k in range(3):
+            axes[0, k] /= degree * (vertical + height) * cos_lat
+            axes[1, k] /= degree * (meridian + height)
+        across = (vertical + height) * cos_lat
+        dx = geocentric[j, 0] - across * cos_lon
+        dy = geocentric[j, 1] - across * sin_lon
+        dz = geocentric[j, 2] - (vertical * (1.0 - e2) + height) * sin_lat
+        for k, value in enumerate((longitude[j] / degree, latitude[j] / degree, height)):
+            geodetic[j, k] = value + axes[k, 0] * dx + axes[k, 1] * dy + axes[k, 2] * dz
+    return geodetic, jacobian
 
 
 def local_axes(geodetic: Array) -> Array:
@@ -102,22 +133,6 @@ def local_axes(geodetic: Array) -> Array:
     rotation[:, 1, 0], rotation[:, 1, 1], rotation[:, 1, 2] = -sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat
     rotation[:, 2, 0], rotation[:, 2, 1], rotation[:, 2, 2] = cos_lat * cos_lon, cos_lat * sin_lon, sin_lat
     return rotation
-
-
-def geodetic_jacobian(geodetic: Array, ellipsoid: Ellipsoid = WGS84) -> Array:
-    """Partials (n, 3, 3) of (longitude, latitude, height) in degrees, degrees, metres with respect to geocentric metres.
-
-    The radii of curvature are those of the meridian and the prime vertical at each point.
-    """
-    lat, height = np.radians(geodetic[:, 1]), geodetic[:, 2]
-    e2 = ellipsoid.eccentricity_squared
-    root = np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
-    prime_vertical = ellipsoid.semimajor_axis / root
-    meridian = prime_vertical * (1.0 - e2) / root**2
-    jacobian = local_axes(geodetic)
-    jacobian[:, 0] *= (180.0 / np.pi / ((prime_vertical + height) * np.cos(lat)))[:, None]
-    jacobian[:, 1] *= (180.0 / np.pi / (meridian + height))[:, None]
-    return jacobian
 
 
 def rotate_covariance(covariance: Array, rotation: Array) -> Array:

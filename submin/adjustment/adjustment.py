@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from submin.adjustment.blunders import bad_cameras, image_statistics, reject_blunders, residuals, robust_weights
 from submin.adjustment.elimination import LinearRays, eliminate, ground_corrections, linearise, moved_rays, point_factors
-from submin.adjustment.estimation import ImageEstimate, estimate_images, prior_variance
+from submin.adjustment.estimation import ImageEstimate, estimate_images
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays
 
@@ -98,7 +98,7 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         judged, statistic = reject_blunders(
             linear, candidates if judgements <= FREE_DECISIONS else weight, theta, estimate.covariance
         )  # fmt: skip
-        worst = image_statistics(theta, estimate.covariance, prior_variance(images.prior, images.parameters))
+        worst = image_statistics(theta, estimate.covariance, images.prior_variance)
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         bad = bad_cameras(worst, linear) & ~released & np.array_equal(judged, weight)
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))

@@ -50,6 +50,8 @@ class ImageEstimate:
         return np.asarray(self.prior @ (self.prior @ fill_symmetric(np.asarray(inverse))).T)
 
 
+DENSE_SIZE = 200
+"""Up to so many parameters a dense product with the a priori factor costs less than looking up its few entries."""
 MIRROR_BLOCK = 256
 
 
@@ -67,6 +69,11 @@ def fill_symmetric(lower: Array) -> Array:
 def reduced_information(information: Array, prior: sp.csr_array) -> Array:
     """``I + K' S K`` (q, q), for summed information S (lower triangle) and a priori factor K."""
     full = fill_symmetric(information.copy())
+    if len(full) <= DENSE_SIZE:
+        dense = prior.toarray()
+        total = dense.T @ (full @ dense)
+        total[np.diag_indices(len(total))] += 1.0
+        return np.asarray(total)
     half = prior.T @ full
     total = np.asarray((prior.T @ np.ascontiguousarray(half.T)).T)
     total[np.diag_indices(len(total))] += 1.0
@@ -105,8 +112,3 @@ def estimate_images(sums: Sums, prior: sp.csr_array, parameters: int) -> ImageEs
     theta = np.asarray(prior @ u).reshape(-1, parameters)
     # f + |u|^2 at the minimum equals f - h'theta
     return ImageEstimate(theta, float(sums.misclosure - sums.vector @ theta.ravel()), factor, prior)
-
-
-def prior_variance(prior: sp.csr_array, parameters: int) -> Array:
-    """Diagonal of ``K K'`` as (m, p)."""
-    return np.asarray(prior.multiply(prior).sum(axis=1)).reshape(-1, parameters)

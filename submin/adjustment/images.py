@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from submin.adjustment.priors import ImagePrior, prior_factor
+from submin.adjustment.priors import ImagePrior, prior_factor, prior_variance
 from submin.geodesy import WGS84, Ellipsoid
 from submin.sensors import Ground, Projection, sensor_named
 
@@ -46,6 +46,11 @@ class ImageSet:
     def prior(self) -> sp.csr_array:
         """A priori factor K (m p, q), see `prior_factor`."""
         return prior_factor(self.priors, self.parameters)
+
+    @cached_property
+    def prior_variance(self) -> Array:
+        """A priori variances (m, p) of the images' parameters."""
+        return prior_variance(self.prior, self.parameters)
 
     @cached_property
     def in_pixels(self) -> NDArray[np.bool_]:

@@ -260,6 +260,13 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     return entries.factor((m * p, columns + len(shared)))
 
 
+def prior_variance(prior: sp.csr_array, parameters: int) -> Array:
+    """Diagonal of ``K K'`` as (m, p)."""
+    row = np.repeat(np.arange(prior.shape[0]), np.diff(prior.indptr))
+    variance: Array = np.bincount(row, prior.data**2, prior.shape[0])
+    return variance.reshape(-1, parameters)
+
+
 @lru_cache(maxsize=1024)
 def _stated(model: APriori, parameter: Parameter) -> Uncertainty:
     return model.of(parameter)

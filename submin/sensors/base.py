@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_jacobian
+from submin.geodesy import WGS84, Ellipsoid, geodetic_with_jacobian
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -37,8 +37,7 @@ class Ground:
     @classmethod
     def at(cls, geocentric: Array, ellipsoid: Ellipsoid = WGS84) -> Ground:
         """Ground points from geocentric coordinates (n, 3) in metres."""
-        geodetic = geocentric_to_geodetic(geocentric, ellipsoid)
-        return cls(np.ascontiguousarray(geocentric), geodetic, geodetic_jacobian(geodetic, ellipsoid))
+        return cls(np.ascontiguousarray(geocentric), *geodetic_with_jacobian(geocentric, ellipsoid))
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from submin.adjustment.elimination import (
     point_factors,
     residuals_of,
 )
-from submin.adjustment.estimation import ImageEstimate, cholesky, estimate_images, fill_symmetric, prior_variance, reduced_information
-from submin.adjustment.priors import APriori, ImagePrior, prior_factor
+from submin.adjustment.estimation import ImageEstimate, cholesky, estimate_images, fill_symmetric, reduced_information
+from submin.adjustment.priors import APriori, ImagePrior, prior_factor, prior_variance
 from submin.errors import NumericalError
 from submin.sensors import sensor_named
 

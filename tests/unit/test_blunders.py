@@ -21,8 +21,8 @@ from submin.adjustment.blunders import (
     robust_weights,
 )
 from submin.adjustment.elimination import LinearRays, eliminate
-from submin.adjustment.estimation import ImageEstimate, estimate_images, prior_variance
-from submin.adjustment.priors import APriori, ImagePrior, prior_factor
+from submin.adjustment.estimation import ImageEstimate, estimate_images
+from submin.adjustment.priors import APriori, ImagePrior, prior_factor, prior_variance
 from submin.sensors import sensor_named
 
 Array = NDArray[np.float64]
