@@ -263,7 +263,7 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
 def prior_variance(prior: sp.csr_array, parameters: int) -> Array:
     """Diagonal of ``K K'`` as (m, p)."""
     row = np.repeat(np.arange(prior.shape[0]), np.diff(prior.indptr))
-    variance: Array = np.bincount(row, prior.data**2, prior.shape[0])
+    variance = np.asarray(np.bincount(row, prior.data**2, prior.shape[0]), dtype=np.float64)
     return variance.reshape(-1, parameters)
 
 

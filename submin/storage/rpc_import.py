@@ -18,12 +18,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from submin.adjustment.priors import APriori
+from submin.adjustment.stated_accuracy import stated_a_priori
 from submin.errors import CatalogueError, InputError
 from submin.formats.columns import integer, number, read_table, text
 from submin.formats.rpc_files import read_rpc
 from submin.geodesy import WGS84
 from submin.sensors import sensor_named
-from submin.sensors.footprint import footprints
+from submin.sensors.footprint import footprints, ground_pixels
 from submin.storage.catalogue_schema import (
     DEFAULT_SIGMA_PX,
     Array,
@@ -40,8 +41,6 @@ from submin.storage.catalogue_writer import CatalogueWriter
 
 PASS_GAP_SECONDS = 180.0
 """Images of one platform further apart in time than this are of two passes."""
-
-_A_PRIORI = APriori()
 
 BLOCKINGS = ("pass", "image", "all")
 
@@ -117,7 +116,7 @@ def import_rpc(
     blocks: Literal["pass", "image", "all"] = "pass",
     dataset: str | None = None,
     shared_ids: bool = False,
-    a_priori: APriori = _A_PRIORI,
+    a_priori: APriori | None = None,
     overwrite: bool = False,
 ) -> ImportSummary:
     """Write a catalogue of images with RPCs and their tie points.
@@ -141,7 +140,8 @@ def import_rpc(
     shared_ids
         Leave point ids as the tracks have them: the same id in another catalogue is the same ground point.
     a_priori
-        What is believed of the cameras.
+        What is believed of the cameras; by default what the RPC files of a block state (see `submin.adjustment.stated_accuracy`), and
+        where they do not, 10 pixels of shift and 1 pixel of drift, half of the shift's variance common to a pass.
     overwrite
         Take the place of a catalogue in ``out``.
 
@@ -171,10 +171,13 @@ def import_rpc(
     records = _records(images_file, Path(rpc_folder), kept, pass_ids, block_ids, tracks, notes)
     prefix = "" if shared_ids else f"{name}/"
     members = _members(records)
+    priors = _priors(members, records) if a_priori is None else _Priors(a_priori, {})
+    if priors.by_block:
+        notes.append(f"a priori sigmas of {len(priors.by_block)} of {len(members)} blocks are those that their RPC files state")
     with writer:
         writer.write_images(records[i] for rows in members.values() for i in rows)
-        writer.write_priors(a_priori)
-        for block in _blocks(members, records, tracks, prefix, a_priori):
+        writer.write_priors(priors.default, priors.by_block)
+        for block in _blocks(members, records, tracks, prefix, priors):
             writer.write_block(block)
     return ImportSummary(
         catalogue=Path(out),
@@ -321,13 +324,43 @@ def _rpc_path(images_file: Path, rpc_folder: Path, image: _Listed) -> Path:
     raise CatalogueError(f"{images_file}: row {image.row}: no RPC of image {image.image_id!r}; expected {' or '.join(map(str, tried))}")
 
 
+def _places(records: Sequence[ImageRecord]) -> tuple[Array, Array]:
+    """First pixels and sizes (m, 2), sample and line, in the RPCs' pixel frames."""
+    first = np.array([json.loads(record.camera)["origin"] for record in records], dtype=np.float64)
+    return first, np.array([(record.width, record.height) for record in records], dtype=np.float64)
+
+
 def _footprints(records: Sequence[ImageRecord]) -> list[bytes]:
     """Polygons (WKB, degrees) of the images' outer pixel edges at each camera's mean height; empty where there is no ground."""
     sensor = sensor_named("rpc")
     cameras = np.stack([record.pack() for record in records])
-    first = np.array([json.loads(record.camera)["origin"] for record in records])
-    size = np.array([(record.width, record.height) for record in records], dtype=np.float64)
+    first, size = _places(records)
     return footprints(sensor, cameras, first, size, sensor.mean_height(cameras), WGS84)
+
+
+@dataclass(frozen=True)
+class _Priors:
+    """What is believed of the cameras of all blocks but some, and of these."""
+
+    default: APriori
+    by_block: Mapping[str, APriori]
+
+    def of(self, block_id: str) -> APriori:
+        return self.by_block.get(block_id, self.default)
+
+
+def _priors(members: Mapping[str, Sequence[int]], records: Sequence[ImageRecord]) -> _Priors:
+    """What the RPC files of each block state, where they do."""
+    default, by_block = APriori(), dict[str, APriori]()
+    cameras = [json.loads(record.camera) for record in records]
+    first, size = _places(records)
+    packed = np.stack([record.pack() for record in records])
+    pixels = ground_pixels(sensor_named("rpc"), packed, first + 0.5 * (size - 1.0), WGS84)
+    for block_id, rows in members.items():
+        stated = stated_a_priori([cameras[i] for i in rows], pixels[list(rows)], default)
+        if stated is not None:
+            by_block[block_id] = stated
+    return _Priors(default, by_block)
 
 
 def _members(records: Sequence[ImageRecord]) -> dict[str, list[int]]:
@@ -341,7 +374,7 @@ def _members(records: Sequence[ImageRecord]) -> dict[str, list[int]]:
 
 
 def _blocks(
-    members: Mapping[str, Sequence[int]], records: Sequence[ImageRecord], tracks: _Tracks, prefix: str, a_priori: APriori
+    members: Mapping[str, Sequence[int]], records: Sequence[ImageRecord], tracks: _Tracks, prefix: str, priors: _Priors
 ) -> list[Block]:
     """Blocks with their rays, in the order of the tracks."""
     block_of, index_in_block = np.empty(len(records), dtype=np.int64), np.empty(len(records), dtype=np.int32)
@@ -357,7 +390,7 @@ def _blocks(
         sigma = np.full(len(rays), DEFAULT_SIGMA_PX)
         blocks.append(
             Block(
-                block_id, tuple(records[i] for i in rows), a_priori, point_ids[rays], index_in_block[tracks.image[rays]],
+                block_id, tuple(records[i] for i in rows), priors.of(block_id), point_ids[rays], index_in_block[tracks.image[rays]],
                 tracks.col[rays], tracks.row[rays], sigma, sigma,
             )
         )  # fmt: skip

@@ -165,6 +165,27 @@ def test_options_reach_the_catalogue(data: Path, tmp_path: Path) -> None:
     assert block.point_ids[:3].tolist() == ["0", "0", "1"]
 
 
+def test_accuracy_stated_by_the_files_becomes_the_prior(ventoux: Path, tmp_path: Path) -> None:
+    """Written into the files here: the vendor's own are silent. Pleiades images come with pixels of half a metre."""
+    for name, bias, random in (("left_image", 14.0, 0.3), ("right_image", 7.0, -1.0)):
+        path = ventoux / "rpc" / f"{name}.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"ERR_BIAS": bias, "ERR_RAND": random}))
+    summary = run_plain(ventoux, tmp_path / "c")
+    model = next(Catalogue.open(tmp_path / "c").blocks()).a_priori
+    assert model is not None and "a priori sigmas of 1 of 1 blocks are those that their RPC files state" in summary.notes
+    # left: hypot(14.0, 0.3) m. The drift of the right image is not stated: the default stays
+    assert 14.0 / 0.52 < model.bias_px < 14.01 / 0.49
+    assert (model.drift_px, model.common_to_pass) == (1.0, 0.5)
+
+
+def test_accuracy_that_one_image_does_not_state_leaves_the_default(ventoux: Path, tmp_path: Path) -> None:
+    path = ventoux / "rpc" / "left_image.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"ERR_BIAS": 14.0, "ERR_RAND": 0.3}))
+    summary = run_plain(ventoux, tmp_path / "c")
+    assert next(Catalogue.open(tmp_path / "c").blocks()).a_priori == APriori()
+    assert not any("a priori" in note for note in summary.notes)
+
+
 def test_the_same_import_twice_is_the_same_content(data: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         run(data / "wv3_jax068", tmp_path / name)

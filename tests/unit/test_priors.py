@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from submin.adjustment.priors import RELEASE_FACTOR, APriori, ImagePrior, correlation_factor, prior_factor
+from submin.adjustment.elimination import Sums
+from submin.adjustment.estimation import estimate_images
+from submin.adjustment.priors import RELEASE_FACTOR, APriori, ImagePrior, Uncertainty, correlation_factor, prior_factor
 from submin.errors import InputError
-from submin.sensors import sensor_named
+from submin.sensors import Parameter, sensor_named
 
 Array = NDArray[np.float64]
 RPC = sensor_named("rpc")
@@ -222,3 +226,117 @@ def test_correlation_in_time_needs_times(correlation: str) -> None:
 def test_times_may_be_unknown_where_they_are_not_needed() -> None:
     priors = [ImagePrior("b", "p", np.nan, APriori(10.0, 1.0, 0.0, "fixed", 0.4), RPC.parameters) for _ in range(2)]
     assert_equal_covariances(covariance(priors), covariance_by_hand(priors))
+
+
+# Parameters of any sensor
+
+ATTITUDE = tuple(Parameter(f"attitude {axis}", "rad", "attitude", 2e-5) for axis in ("alpha", "beta"))
+FRAME = (Parameter("in track", "m", "position", 5.0), *ATTITUDE, Parameter("focal length", "mm", "focal length", 0.1))
+
+
+def stated(model: APriori, parameters: tuple[Parameter, ...] = FRAME) -> dict[str, Uncertainty]:
+    return {parameter.name: model.of(parameter) for parameter in parameters}
+
+
+def test_a_sensor_states_what_the_priors_do_not() -> None:
+    found = stated(APriori(correlation="fixed", correlation_parameter=0.3))
+    assert {name: u.sigma for name, u in found.items()} == {
+        "in track": 5.0, "attitude alpha": 2e-5, "attitude beta": 2e-5, "focal length": 0.1
+    }  # fmt: skip
+    assert {(u.correlation, u.correlation_parameter, u.common_to_pass) for u in found.values()} == {("fixed", 0.3, 0.0)}
+
+
+def test_a_name_goes_before_its_group_and_both_before_the_sensor() -> None:
+    found = stated(APriori(parameters={
+        "attitude": {"sigma": 1e-4, "correlation": "gaussian", "correlation_parameter": 200},
+        "attitude beta": {"sigma": 3e-4, "common_to_pass": 0.25},
+        "focal length": {"sigma": 0},
+    }))  # fmt: skip
+    assert found["attitude alpha"] == Uncertainty(1e-4, 0.0, "gaussian", 200.0)
+    assert found["attitude beta"] == Uncertainty(3e-4, 0.25, "gaussian", 200.0)
+    assert found["focal length"].sigma == 0.0 and found["in track"].sigma == 5.0
+
+
+def test_each_parameter_has_its_own_correlation_in_time() -> None:
+    model = APriori(parameters={
+        "in track": {"sigma": 6.0, "correlation": "gaussian", "correlation_parameter": 2000.0},
+        "attitude": {"correlation": "exponential", "correlation_parameter": 100.0},
+        "attitude beta": {"common_to_pass": 0.5},
+        "focal length": {"sigma": 0.0},
+    })  # fmt: skip
+    seconds = (0.0, 80.0, 200.0)
+    priors = [ImagePrior("b", f"pass {k // 2}", t, model, FRAME) for k, t in enumerate(seconds)]
+    q = np.asarray((prior_factor(priors, 5) @ prior_factor(priors, 5).T).toarray()).reshape(3, 5, 3, 5)
+    dt = np.abs(np.subtract.outer(seconds, seconds))
+    np.testing.assert_allclose(q[:, 0, :, 0], 36.0 * np.exp(-((dt / 2000.0) ** 2)), rtol=1e-12)
+    np.testing.assert_allclose(q[:, 1, :, 1], 4e-10 * np.exp(-dt / 100.0), rtol=1e-12)
+    same_pass = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])
+    np.testing.assert_allclose(q[:, 2, :, 2], 2e-10 * np.exp(-dt / 100.0) + 2e-10 * same_pass, rtol=1e-12)
+    assert not q[:, 3:].any() and not q[:, 0, :, 1:].any(), "held, padded, and never correlated with one another"
+
+
+@pytest.mark.parametrize(("correction", "adjustable"), [("shift", (0, 3)), ("shift+drift", (0, 2, 3, 5)), ("affine", range(6))])
+def test_corrections_of_an_rpc(correction: str, adjustable: Sequence[int]) -> None:
+    q = covariance([ImagePrior("b", "p", 0.0, APriori(10.0, 2.0, 0.5, correction=correction), RPC.parameters)])
+    sigmas = np.array([10.0, 2.0, 2.0, 10.0, 2.0, 2.0])
+    np.testing.assert_allclose(np.diag(q), np.where(np.isin(np.arange(P), list(adjustable)), sigmas**2, 0.0), rtol=1e-14)
+
+
+def test_sensors_of_a_block_are_not_correlated_with_each_other() -> None:
+    model = APriori(10.0, 1.0, 0.0, "fixed", 0.5)
+    priors = [ImagePrior("b", "p", 0.0, model, parameters) for parameters in (RPC.parameters, FRAME, RPC.parameters, FRAME)]
+    q = covariance(priors).reshape(4, P, 4, P)
+    assert q[0, 0, 2, 0] == pytest.approx(50.0) and q[1, 0, 3, 0] == pytest.approx(12.5)
+    assert not q[0, :, 1].any() and not q[0, :, 3].any()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"parameters": {"position": 6.0}}, "'position' is 6.0; expected an object with some of sigma, common_to_pass"),
+        ({"parameters": {"position": {"sigm": 6.0}}}, "'position': unknown key 'sigm'; expected some of sigma"),
+        ({"parameters": {"position": {"sigma": -6.0}}}, "'position': sigma is -6.0; expected 0"),
+        ({"parameters": {"position": {"sigma": "six"}}}, "'position' holds something that is not a number"),
+        ({"parameters": {"rate": {"correlation": "fixed", "correlation_parameter": 1.0}}}, "'rate': fixed correlation is 1.0"),
+        ({"parameters": [1]}, "parameters is"),
+        ({"correction": "cubic"}, "correction is 'cubic'; expected one of shift, shift\\+drift, affine"),
+    ],
+)
+def test_entries_by_parameter_that_cannot_be(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        APriori.from_mapping(values)
+
+
+def test_a_mapping_comes_back_as_the_same_model() -> None:
+    model = APriori(8.0, 0.5, correction="shift", parameters={"rate": {"sigma": 1e-6}})
+    assert APriori.from_mapping(model.to_mapping()) == model
+    assert set(APriori().to_mapping()) == {"bias_px", "drift_px", "common_to_pass", "correlation", "correlation_parameter"}
+
+
+def test_nearly_equal_images_are_adjusted_to_full_accuracy() -> None:
+    """Six images within 25 s, T = 5,000 s: the correlation has condition 1e27. Against the same adjustment with 80 digits."""
+    seconds, sigma, t = 5.0 * np.arange(6), 6.0, 5000.0
+    model = APriori(parameters={"in track": {"sigma": sigma, "correlation": "gaussian", "correlation_parameter": t}})
+    track = (FRAME[0],)
+    priors = [ImagePrior("b", "p", s, model, track) for s in seconds]
+    rng = np.random.default_rng(4)
+    design, y = rng.normal(size=(40, 6)), rng.normal(0.0, 3.0, 40)
+    information = design.T @ design
+    estimate = estimate_images(Sums(np.tril(information), design.T @ y, float(y @ y), 40), prior_factor(priors, 1), 1)
+
+    with mpmath.workdps(80):
+        dt = mpmath.matrix(6, 6)
+        for i in range(6):
+            for k in range(6):
+                dt[i, k] = mpmath.mpf(sigma) ** 2 * mpmath.exp(-(((mpmath.mpf(seconds[i]) - mpmath.mpf(seconds[k])) / t) ** 2))
+        a = mpmath.matrix(design.tolist())
+        gain = dt * a.T * mpmath.inverse(a * dt * a.T + mpmath.eye(40))
+        expected = np.array((dt - gain * a * dt).tolist(), dtype=np.float64)
+        theta = np.array((gain * mpmath.matrix(y.tolist())).tolist(), dtype=np.float64).ravel()
+    # 1 - 1e-6 in float64, the correlation of neighbours, is known to 1e-10 of its distance from 1: there is no more to be had
+    np.testing.assert_allclose(estimate.covariance, expected, rtol=1e-10)
+    np.testing.assert_allclose(estimate.theta.ravel(), theta, rtol=1e-10)
+    # a plain inverse of the a priori covariance loses all of it
+    q = np.asarray(sigma**2 * np.exp(-((np.subtract.outer(seconds, seconds) / t) ** 2)))
+    naive = np.linalg.inv(np.linalg.inv(q) + information)
+    assert np.abs(naive / expected - 1.0).max() > 1e-6
