@@ -275,7 +275,14 @@ def _priors(values: Mapping[str, Any]) -> tuple[APriori, dict[str, APriori]]:
     if not (isinstance(entries, dict) and isinstance(by_block, dict) and all(isinstance(e, dict) for e in by_block.values())):
         raise CatalogueError("'default' and every entry of 'blocks' must be JSON objects")
     default = APriori.from_mapping(entries)
-    return default, {block_id: APriori.from_mapping({**default.to_mapping(), **entry}) for block_id, entry in by_block.items()}
+    return default, {block_id: APriori.from_mapping(_over(default.to_mapping(), entry)) for block_id, entry in by_block.items()}
+
+
+def _over(default: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry over the default; so are its entries by parameter."""
+    inner = [values.get("parameters", {}) for values in (default, entry)]
+    merged = {**default, **entry}
+    return merged | {"parameters": {**inner[0], **inner[1]}} if all(isinstance(values, dict) for values in inner) else merged
 
 
 def _read_images(path: Path) -> tuple[ImageRecord, ...]:

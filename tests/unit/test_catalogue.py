@@ -202,6 +202,11 @@ class TestRoundTrip:
         (folder / "priors.json").unlink()
         assert Catalogue.open(folder).a_priori("A") == APriori()
 
+    def test_entries_by_parameter_of_a_block_stand_beside_those_of_the_default(self, folder: Path) -> None:
+        entries = {"default": {"parameters": {"rate": {"sigma": 1}}}, "blocks": {"A": {"parameters": {"position": {"sigma": 2}}}}}
+        (folder / "priors.json").write_text(json.dumps(entries))
+        assert Catalogue.open(folder).a_priori("A").parameters == {"rate": {"sigma": 1}, "position": {"sigma": 2}}
+
 
 class TestContentHash:
     def test_order_and_layout_leave_no_trace(self) -> None:
@@ -522,3 +527,13 @@ class TestWriter:
     def test_writing_needs_an_open_writer(self, tmp_path: Path) -> None:
         with pytest.raises(CatalogueError, match="not open"):
             CatalogueWriter(tmp_path / "c", CatalogueMetadata("n")).write_block(block("A"))
+
+
+def test_the_documented_priors_are_read_as_they_stand(folder: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "catalogue.md").read_text(encoding="utf-8")
+    values = json.loads(text.split("```json")[1].split("```")[0])
+    values["blocks"] = {"A": values["blocks"]["block 1"]}
+    (folder / "priors.json").write_text(json.dumps(values))
+    catalogue = Catalogue.open(folder)
+    assert catalogue.default_prior == APriori()
+    assert catalogue.a_priori("A").parameters["attitude kappa"] == {"sigma": 1e-4, "common_to_pass": 0.5}
