@@ -5,10 +5,11 @@ from collections.abc import Iterable
 from submin.errors import InputError
 from submin.sensors.base import Ground, Parameter, Projection, Sensor
 from submin.sensors.frame import FrameSensor
+from submin.sensors.pushbroom import PushbroomSensor
 from submin.sensors.rpc import RpcSensor
 from submin.sensors.survey import SurveySensor
 
-SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in (RpcSensor(), FrameSensor(), SurveySensor())}
+SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in (RpcSensor(), PushbroomSensor(), FrameSensor(), SurveySensor())}
 
 
 def width_of(sensors: Iterable[str]) -> int:
