@@ -11,11 +11,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import faults, main_job
+from benchmarks import faults, main_job, stage_one
 from benchmarks.machine import machine
 
 BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "main-job": ("the rate of every station from rays to a committed network", main_job.measure),
+    "stage-1": ("projection, and a triplet through stage 1: fast, and linear in rays", stage_one.measure),
     "faults": ("a run whose processes are killed leaves the network of an undisturbed one", faults.measure),
 }
 
