@@ -476,7 +476,7 @@ class PushbroomSensor:
         middle = _linear(0.5 * (height - 1.0), lines, line_times)
         _require_resolved(line_times, lines, max(abs(times[0]), abs(times[-1]), abs(middle)))
 
-        reach_lines, reach_samples = max(MARGIN * height, MARGIN_PIXELS), max(MARGIN * width, MARGIN_PIXELS)
+        reach_samples, reach_lines = margins(width, height)
         first, last = sorted(_linear(line, lines, line_times) for line in (0.0, height - 1.0))
         _require_cover("position", times, first, last)
         _require_cover("attitude", turns, first, last)
@@ -519,6 +519,11 @@ class PushbroomSensor:
     def mean_height(self, cameras: Array) -> Array:
         """The height that each description gives."""
         return cameras[:, _MEAN_HEIGHT]
+
+
+def margins(width: float, height: float) -> tuple[float, float]:
+    """Samples and lines by which a point may lie outside of an image of that size on each side."""
+    return max(MARGIN * width, MARGIN_PIXELS), max(MARGIN * height, MARGIN_PIXELS)
 
 
 def _array(camera: Mapping[str, Any], table: str, name: str, shape: tuple[int, ...]) -> Array:
