@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.errors import InputError
-from submin.sensors.pushbroom import margins
+from submin.sensors.pushbroom_camera import margins
 
 Array = NDArray[np.float64]
 
@@ -192,7 +192,8 @@ def _samples(root: ElementTree.Element, section: str, name: str, columns: int, e
     count = int(_number(root, f"{section}/NUMPOINTS"))
     if not (len(rows) == count and np.array_equal(rows[:, 0], np.arange(1, count + 1))):
         raise InputError(f"{section}/{name}List has {len(rows)} rows; expected {count}, numbered from 1")
-    return _since(_time(root, f"{section}/STARTTIME"), epoch) + interval * np.arange(count), rows[:, 1:]
+    times: Array = _since(_time(root, f"{section}/STARTTIME"), epoch) + interval * np.arange(count, dtype=np.float64)
+    return times, rows[:, 1:]
 
 
 def _needed(times: Array, reached: Array) -> slice:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from submin.errors import InputError
 from submin.geodesy import WGS84, Ellipsoid, geodetic_to_geocentric, local_axes
 from submin.sensors import Ground, sensor_named
-from submin.sensors.pushbroom import MARGIN, MARGIN_PIXELS, SPEED_OF_LIGHT
+from submin.sensors.pushbroom_camera import MARGIN, MARGIN_PIXELS, SPEED_OF_LIGHT
 
 Array = NDArray[np.float64]
 
