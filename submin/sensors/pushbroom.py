@@ -36,7 +36,7 @@ import numpy as np
 
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic, local_axes
 from submin.sensors.base import Array, Ground, Index, Parameter, Projection
-from submin.sensors.pushbroom_camera import MEAN_HEIGHT, PER_LIGHT, ROTATION, SCALE_HEIGHT, ZENITH_PATH, packed_camera
+from submin.sensors.pushbroom_camera import MEAN_HEIGHT, PER_LIGHT, ROTATION, SCALE_HEIGHT, TABLES, ZENITH_PATH, packed_camera
 from submin.sensors.pushbroom_sight import LOWEST_SIGHT, looks, project
 
 LOCALISED_METRES = 1e-7
@@ -96,8 +96,8 @@ class PushbroomSensor:
         position, speed, light = looks(cameras, image, samples, lines)
         geodetic = np.full((len(image), 3), np.nan)
         sighted = np.isfinite(light).all(axis=1)
-        camera, h = cameras[image[sighted]], heights[sighted]
-        geodetic[sighted] = _cut(camera, position[sighted], speed[sighted], light[sighted], h, ellipsoid)
+        headers, h = cameras[image[sighted], :TABLES], heights[sighted]
+        geodetic[sighted] = _cut(headers, position[sighted], speed[sighted], light[sighted], h, ellipsoid)
         geodetic[:, 2] = heights
         return geodetic
 
