@@ -16,9 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
+from networks import fuse
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+import submin
+from submin.accuracy import nees_per_dof
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.elimination import eliminate, linearise, point_factors
 from submin.adjustment.estimation import estimate_images
@@ -31,7 +35,8 @@ from submin.formats.worldview import WorldViewImage, read_worldview
 from submin.geodesy import WGS84, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
 from submin.network.sub_min import GroundPart, joint_covariance, loadings
 from submin.sensors import Ground, sensor_named
-from submin.storage.catalogue_schema import ImageRecord
+from submin.storage.catalogue_schema import Block, CatalogueMetadata, ImageRecord
+from submin.storage.catalogue_writer import CatalogueWriter
 
 Array = NDArray[np.float64]
 
@@ -219,6 +224,43 @@ def test_description_goes_through_a_catalogue(pair: list[Compared]) -> None:
     assert (image.image_id, image.satellite, image.band, image.width, image.height) == ("1030010033C4AA00", "WV02", "P", 32837, 27968)
     assert image.acquired == "2014-06-19T18:52:50.787577Z"
     assert len(record.camera) < 40_000
+
+
+def test_a_catalogue_of_the_pair_becomes_a_network(pair: list[Compared], tmp_path: Path) -> None:
+    """Simulated rays through the product's own path: catalogue, stage 1, tiles, query; attitudes as the vendor states them, rates not."""
+    points, rng = 300, np.random.default_rng(4)
+    truth = places(rng, points)
+    a_priori = APriori(parameters=pair[0].image.uncertainties | {"rate": {"sigma": 0.0}})
+    records = tuple(
+        ImageRecord(
+            c.image.image_id, "pair", "pass", c.image.satellite, "pushbroom", json.dumps(c.image.camera), c.image.width, c.image.height,
+            c.image.acquired,
+        )
+        for c in pair
+    )  # fmt: skip
+    image, point = np.repeat(np.arange(2, dtype=np.int32), points), np.tile(np.arange(points), 2)
+    sigmas = [a_priori.parameters[p.name]["sigma"] if p.group == "attitude" else 0.0 for p in PUSHBROOM.parameters]
+    thetas = rng.normal(0.0, sigmas, (2, 6))
+    seen = [
+        PUSHBROOM.project(record.pack()[None], theta[None], Ground.at(truth), rows(points), np.arange(points, dtype=np.int32)).image
+        for record, theta in zip(records, thetas, strict=True)
+    ]
+    measured = np.concatenate(seen) + rng.normal(0.0, 0.5, (2 * points, 2))
+    sigma = np.full(2 * points, 0.5)
+    ids = np.array([f"point {k:03}" for k in range(points)])
+    with CatalogueWriter(tmp_path / "catalogue", CatalogueMetadata("mojave")) as writer:
+        writer.write_images(records)
+        writer.write_priors(a_priori)
+        writer.write_block(Block("pair", records, a_priori, ids[point], image, measured[:, 0], measured[:, 1], sigma, sigma))
+    area = shapely.box(-116.24, 35.14, -116.08, 35.25)
+    result = fuse(tmp_path / "catalogue", tmp_path / "network", area, tile_km=10.0, overlap_km=4.0)
+    assert (result.fused, result.rejected) == (1, ())
+    found = submin.open(tmp_path / "network").query(bbox=(-116.24, 35.14, -116.08, 35.25), policy="rigorous")
+    assert len(found.ids) > 0.98 * points
+    error = found.geocentric - truth[np.searchsorted(ids, found.ids)]
+    assert abs(nees_per_dof(error.ravel(), found.covariance) - 1.0) < 4.0 * np.sqrt(2.0 / error.size)
+    # attitudes of 10 to 15 microradians from 780 km
+    assert 10.0 < np.median(found.ce90) < 30.0
 
 
 def test_the_margin_of_the_image_is_sampled(pair: list[Compared]) -> None:
