@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from submin.adjustment.blunders import bad_cameras, image_statistics, reject_blunders, residuals, robust_weights
 from submin.adjustment.elimination import LinearRays, eliminate, ground_corrections, linearise, moved_rays, point_factors
 from submin.adjustment.estimation import ImageEstimate, estimate_images
+from submin.adjustment.explained import explained_metres
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays
+from submin.errors import NumericalError
 
 Array = NDArray[np.float64]
 
@@ -26,8 +28,9 @@ MAX_ITERATIONS = 40
 FREE_DECISIONS = 12
 """Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
 REACH_METRES = 5000.0
-"""A point is linearised no farther than this from where it was registered. The estimate of a weak point (rays of one viewpoint) may lie
-anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours to choose."""
+"""A point is linearised no farther than this, or than its cameras explain, from where it was registered. The estimate of a weak point (rays
+of one viewpoint) may lie anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours
+to choose."""
 CONVERGED_SIGMAS = 2e-6
 """A step that moves no ray by more than this, in sigmas of its measurement, is none."""
 CONVERGED_METRES = 1e-5
@@ -64,23 +67,28 @@ class Adjustment:
 def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None = None) -> Adjustment:
     """Adjust m images and n ground points by their rays, from ground positions ``start`` (n, 3) and unadjusted cameras.
 
-    ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within `REACH_METRES` of it.
+    ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within reach of it.
 
     Raises
     ------
     NumericalError
-        When the rays' information is not finite or not positive definite.
+        When a position is not finite, or the rays' information is not finite or not positive definite.
     """
+    if not np.isfinite(start).all():
+        raise NumericalError(f"the positions of {int((~np.isfinite(start)).any(axis=1).sum())} of {len(start)} points are not finite")
     theta = np.zeros((len(images), images.parameters))
     ground, anchor = start.copy(), start if registered is None else registered
+    reach = _reach(images, rays, anchor)
+    # round-off of normal equations goes with the square of how much worse cameras are known than rays are measured
+    round_off = (reach.max(initial=REACH_METRES) / REACH_METRES) ** 2
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
     iteration = 0
     while iteration < ROBUST_ITERATIONS:
         iteration += 1
-        linear, estimate, ground = _step(images, rays, theta, ground, anchor, weight)
+        linear, estimate, ground = _step(images, rays, theta, ground, anchor, reach, weight)
         theta = estimate.theta
-        before, weight = weight, robust_weights(linear, candidates, theta)
+        before, weight = weight, robust_weights(linear, np.where(_seen(linear), candidates, 0.0), theta)
         if np.abs(weight - before).max(initial=0.0) < SETTLED_WEIGHT:
             break
 
@@ -91,19 +99,18 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     converged, judgements = False, 0
     while not converged and judgements < MAX_ITERATIONS:
         judgements += 1
-        linear, estimate, reached = _step(images, rays, theta, ground, anchor, weight)
-        step = np.abs(moved_rays(linear, estimate.theta - theta)).max(initial=0.0)
+        linear, estimate, reached = _step(images, rays, theta, ground, anchor, reach, weight)
+        step = np.abs(moved_rays(linear, estimate.theta - theta)[_seen(linear)]).max(initial=0.0)
         step_m = np.abs(reached - ground).max(initial=0.0)
         theta, ground = estimate.theta, reached
-        judged, statistic = reject_blunders(
-            linear, candidates if judgements <= FREE_DECISIONS else weight, theta, estimate.covariance
-        )  # fmt: skip
+        judgeable = np.where(_seen(linear), candidates if judgements <= FREE_DECISIONS else weight, 0.0)
+        judged, statistic = reject_blunders(linear, judgeable, theta, estimate.covariance)
         worst = image_statistics(theta, estimate.covariance, images.prior_variance)
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         bad = bad_cameras(worst, linear) & ~released & np.array_equal(judged, weight)
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
         converged = (
-            step < CONVERGED_SIGMAS and step_m < CONVERGED_METRES and not bad.any() and bool(np.array_equal(judged, weight))
+            max(step / CONVERGED_SIGMAS, step_m / CONVERGED_METRES) < round_off and not bad.any() and bool(np.array_equal(judged, weight))
         )  # fmt: skip
         weight, released = judged, released | bad
         images = images.release(bad) if bad.any() else images
@@ -116,15 +123,30 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
 
 
 def _step(
-    images: ImageSet, rays: Rays, theta: Array, ground: Array, anchor: Array, weight: Array
+    images: ImageSet, rays: Rays, theta: Array, ground: Array, anchor: Array, reach: Array, weight: Array
 ) -> tuple[LinearRays, ImageEstimate, Array]:
     """One Gauss-Newton step.
 
-    Returns the linearised rays, the images' new estimate, and the points' new positions (n, 3), within reach of their anchors.
+    Returns the linearised rays, the images' new estimate, and the points' new positions (n, 3), within reach (n,) of their anchors. A ray
+    of a point that its camera does not see where both are now is left out of this step.
     """
     linear = linearise(images, rays, theta, ground, ground)
+    weight = np.where(_seen(linear), weight, 0.0)
     estimate = estimate_images(eliminate(linear, weight, len(images)), images.prior, images.parameters)
     offset = ground + ground_corrections(point_factors(linear, weight), linear, estimate.theta) - anchor
     distance = np.linalg.norm(offset, axis=1)
-    offset *= np.minimum(1.0, REACH_METRES / np.maximum(distance, REACH_METRES))[:, None]
+    offset *= (reach / np.maximum(distance, reach))[:, None]
     return linear, estimate, anchor + offset
+
+
+def _reach(images: ImageSet, rays: Rays, anchor: Array) -> Array:
+    """Metres (n,) from its anchor within which each point is linearised: `REACH_METRES`, or what its cameras explain."""
+    projection = images.project(np.zeros((len(images), images.parameters)), images.ground(anchor), rays.image, rays.point)
+    reach = np.full(len(anchor), REACH_METRES)
+    np.maximum.at(reach, rays.point, explained_metres(projection, images.prior_variance[rays.image], rays.sigma))
+    return reach
+
+
+def _seen(linear: LinearRays) -> NDArray[np.bool_]:
+    """True (r,) for rays whose camera sees the point where both were linearised."""
+    return np.asarray(np.isfinite(linear.y).all(axis=1))

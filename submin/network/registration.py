@@ -7,15 +7,16 @@ order of their ids: where a point is registered depends on its rays alone, not o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from submin.adjustment.explained import explained_metres
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
-from submin.geodesy import geocentric_to_geodetic
+from submin.geodesy import geocentric_to_geodetic, geodetic_to_geocentric
 from submin.network.cell import Cell, RegisteredPoints
 from submin.tiling.cover import Cover
 
@@ -24,7 +25,7 @@ Ids = NDArray[np.str_]
 Flags = NDArray[np.bool_]
 
 SAME_POINT_METRES = 1000.0
-"""Rays of one point id that pass each other by more than this belong to two places."""
+"""Rays of one point id that pass each other by more than this, and than unadjusted cameras explain, belong to two places."""
 IN_THE_NETWORK = -1
 """Block of a ray that the network has already."""
 
@@ -151,18 +152,42 @@ def contradictions(
     counts = rays.accepted | ~np.isfinite(registration.passing).all(axis=1)
     far, apart = _apart(rays.point_ids[counts], registration.passing[counts])
     doubtful = rays.take(counts & np.isin(rays.point_ids, far[apart > SAME_POINT_METRES]))
+    names, most = _most_apart(doubtful, images, image_rows)
     kept = doubtful.block == IN_THE_NETWORK
     found: dict[int, tuple[str, float]] = {}
     for block in np.unique(doubtful.block[~kept]).tolist():
         mine = doubtful.block == block
         together_now = doubtful.take((kept | mine) & np.isin(doubtful.point_ids, doubtful.point_ids[mine]))
         points, apart = _apart(together_now.point_ids, register(together_now, images, image_rows, cover).passing)
-        worst = int(np.argmax(apart))
-        if apart[worst] > SAME_POINT_METRES:
+        too_far = apart - most[np.searchsorted(names, points)]
+        worst = int(np.argmax(too_far))
+        if too_far[worst] > 0.0:
             found[block] = (str(points[worst]), float(apart[worst]))
         else:
             kept |= mine
     return found
+
+
+def _most_apart(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32]) -> tuple[Ids, Array]:
+    """Points of some rays, ascending, and how far apart (n,) their rays may place each, metres, with cameras known as they are a priori."""
+    names, point = np.unique(rays.point_ids, return_inverse=True)
+    most = np.zeros(len(names))
+    if len(names):
+        seen, image = np.unique(np.searchsorted(image_rows, rays.image), return_inverse=True)
+        np.maximum.at(most, point, _explained(images.take(seen), image.astype(np.int32), rays))
+    return names, np.maximum(SAME_POINT_METRES, 2.0 * most)  # one ray to the one side, another to the other
+
+
+def _explained(images: ImageSet, image: NDArray[np.int32], rays: LooseRays) -> Array:
+    """See `explained_metres`; 0 for a ray that meets no ground. Which cameras were found to be bad, in whatever order, does not matter."""
+    images = replace(images, priors=tuple(replace(prior, released=False) for prior in images.priors))
+    place = geodetic_to_geocentric(images.localise(image, rays.observed), images.ellipsoid)
+    reached = np.isfinite(place).all(axis=1)
+    seen, every = image[reached], np.arange(int(reached.sum()), dtype=np.int32)
+    projection = images.project(np.zeros((len(images), images.parameters)), images.ground(place[reached]), seen, every)
+    explained = np.zeros(len(image))
+    explained[reached] = explained_metres(projection, images.prior_variance[seen], rays.sigma[reached])
+    return explained
 
 
 def _apart(point_ids: Ids, passing: Array) -> tuple[Ids, Array]:

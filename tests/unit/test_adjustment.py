@@ -13,6 +13,7 @@ from submin.adjustment import blunders
 from submin.adjustment.adjustment import REACH_METRES, Adjustment, adjust
 from submin.adjustment.elimination import eliminate, linearise, point_factors
 from submin.adjustment.estimation import estimate_images
+from submin.adjustment.explained import EXPLAINED_SIGMAS, explained_metres
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
@@ -20,7 +21,8 @@ from submin.adjustment.rays import Rays, sorted_rays
 from submin.errors import NumericalError
 from submin.geodesy import WGS84, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
 from submin.network.sub_min import GroundPart, joint_covariance, loadings
-from submin.sensors import sensor_named
+from submin.sensors import Ground, sensor_named
+from submin.sensors.frame import quaternion_rotation
 
 Array = NDArray[np.float64]
 
@@ -308,6 +310,92 @@ def test_ground_that_is_not_a_number_is_an_error() -> None:
     start[3] = np.nan
     with pytest.raises(NumericalError):
         adjust(block.images, block.rays, start)
+
+
+# Cameras known to kilometres only
+
+
+def frame_camera(position: Array, look_at: Array) -> dict[str, Any]:
+    """A frame camera of 100 mm and 10 micrometre pixels that looks at a place."""
+    sight = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(sight, position / np.linalg.norm(position))
+    right /= np.linalg.norm(right)
+    return {
+        "position": position.tolist(), "rotation": [right.tolist(), np.cross(sight, right).tolist(), sight.tolist()], "focal_length": 100.0,
+        "mm_to_pixel": [[2000.0, 100.0, 0.0], [2000.0, 0.0, 100.0]], "height": 500.0,
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FrameBlock:
+    """Four frame images from 100 km up of points around the centre, and where their cameras are said to be."""
+
+    images: ImageSet
+    rays: Rays
+    ground: Array
+
+
+def frame_block(off_m: float, off_rad: float, seed: int = 3, **sigmas: float) -> FrameBlock:
+    """Images whose stated cameras are off by so much; a priori sigmas by group of parameters, and ground that they share."""
+    rng, sensor = np.random.default_rng(seed), sensor_named("frame")
+    geodetic = CENTRE + rng.uniform(-1.0, 1.0, (40, 3)) * np.array([0.12, 0.09, 400.0])
+    ground, middle = geodetic_to_geocentric(geodetic), geodetic_to_geocentric(CENTRE[None])[0]
+    places = geodetic_to_geocentric(
+        np.array([[*(CENTRE[:2] + move), 100_500.0] for move in ((-0.5, 0.0), (0.0, -0.3), (0.1, 0.3), (0.5, 0.0))])
+    )
+    true = np.stack([sensor.pack(frame_camera(place, middle), 4000, 4000) for place in places])
+    stated = []
+    for place in places:
+        camera = frame_camera(place + rng.normal(0.0, off_m, 3), middle)
+        turn = quaternion_rotation(np.array([1.0, *(0.5 * rng.normal(0.0, off_rad, 3))]))
+        stated.append(sensor.pack(camera | {"rotation": (np.array(camera["rotation"]) @ turn).tolist()}, 4000, 4000))
+    image, point = np.tile(np.arange(4, dtype=np.int32), 40), np.repeat(np.arange(40, dtype=np.int32), 4)
+    seen = sensor.project(true, np.zeros((4, 7)), Ground.at(ground), image, point).image
+    measured = seen + rng.normal(0.0, SIGMA_PX, seen.shape)
+    rays = sorted_rays(point, image, measured, np.full(seen.shape, SIGMA_PX), np.ones(len(image), dtype=np.bool_))
+    a_priori = APriori(parameters={group: {"sigma": sigma, "common_to_pass": 0.0} for group, sigma in sigmas.items()})
+    priors = tuple(ImagePrior("block", "pass", float(k), a_priori, sensor.parameters) for k in range(4))
+    names = tuple(f"image {k}" for k in range(4))
+    return FrameBlock(ImageSet(names, ("frame",) * 4, np.stack(stated), priors, 7), rays, ground)
+
+
+def test_points_may_move_as_far_as_their_cameras_explain() -> None:
+    """Cameras off by kilometres, and known to be: the start is tens of kilometres off, and the points arrive all the same."""
+    block = frame_block(1000.0, 0.1, position=1000.0, attitude=0.1, **{"focal length": 0.0})
+    start = intersect(block.images, block.rays, 40).geocentric
+    result = adjust(block.images, block.rays, start)
+    assert result.converged and result.accepted.all() and not result.released.any()
+    moved = np.linalg.norm(result.ground - start, axis=1)
+    assert moved.max() > 1.5 * REACH_METRES
+    assert np.sqrt(np.nanmean(result.residuals**2)) < 1.0
+    assert np.linalg.norm(result.ground - block.ground, axis=1).max() < 4.0 * 10_000.0
+
+
+def test_what_cameras_explain_is_their_a_priori_sigma_on_the_ground() -> None:
+    block = frame_block(0.0, 0.0, position=0.0, attitude=0.01, **{"focal length": 0.0})
+    projection = block.images.project(
+        np.zeros((4, 7)), block.images.ground(block.ground), block.rays.image, block.rays.point
+    )  # fmt: skip
+    explained = explained_metres(projection, block.images.prior_variance[block.rays.image], block.rays.sigma)
+    distance = np.linalg.norm(block.ground[block.rays.point] - block.images.cameras[block.rays.image, :3], axis=1)
+    # two angles across the line of sight; the image is stretched away from its middle, where rays are
+    np.testing.assert_allclose(explained, EXPLAINED_SIGMAS * np.sqrt(2.0) * 0.01 * distance, rtol=0.1)
+    held = frame_block(0.0, 0.0, position=0.0, attitude=0.0, **{"focal length": 0.0})
+    by_measurement = explained_metres(projection, held.images.prior_variance[held.rays.image], held.rays.sigma)
+    np.testing.assert_allclose(by_measurement, EXPLAINED_SIGMAS * np.sqrt(2.0) * SIGMA_PX * distance / 10_000.0, rtol=0.1)
+
+
+def test_a_ray_that_its_camera_does_not_see_is_rejected_and_nothing_else() -> None:
+    """A point behind one camera: the measurement is a mistake, and what the other images measure stands."""
+    block = frame_block(0.0, 0.0, position=10.0, attitude=1e-4, **{"focal length": 0.0})
+    backwards = block.images.cameras.copy()
+    backwards[3, 3:12] *= -1.0
+    images = replace(block.images, cameras=backwards)
+    result = adjust(images, block.rays, block.ground)
+    assert result.converged
+    np.testing.assert_array_equal(result.accepted, block.rays.image != 3)
+    np.testing.assert_array_equal(result.theta[3], 0.0)
+    assert np.isfinite(result.ground).all() and np.isfinite(result.theta).all()
 
 
 # Approximate positions

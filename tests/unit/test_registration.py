@@ -616,6 +616,21 @@ def test_apart_is_told_to_every_ray_of_the_point_and_to_no_other() -> None:
     assert metres == pytest.approx(told[of_p][0])
 
 
+@pytest.mark.parametrize(("bias_px", "contradicts"), [(10.0, True), (300.0, True), (700.0, False)])
+def test_cameras_known_to_kilometres_only_explain_kilometres(bias_px: float, contradicts: bool) -> None:
+    """3 km apart; four sigmas of both axes, half-metre pixels, one camera to each side: 5.7 bias sigmas in metres."""
+    images = replace(IMAGES, priors=tuple(replace(prior, a_priori=APriori(bias_px=bias_px)) for prior in IMAGES.priors))
+    rays = together([arriving(["p"], THERE, [0, 1]), arriving(["p"], places([3000.0], [0.0]), [2], block=1)])
+    assert bool(contradictions(rays, register(rays, images, ROWS, COVER), images, ROWS, COVER)) is contradicts
+
+
+def test_cameras_found_to_be_bad_explain_no_more_than_before() -> None:
+    """What was found depends on what came before; whether a block contradicts must not."""
+    rays = together([arriving(["p"], THERE, [0, 1]), arriving(["p"], places([3000.0], [0.0]), [2], block=1)])
+    released = IMAGES.release(np.ones(len(IMAGES), dtype=np.bool_))
+    assert contradictions(rays, register(rays, released, ROWS, COVER), released, ROWS, COVER) == contradicting(rays) != {}
+
+
 @pytest.mark.parametrize(("rays_there", "most"), [(1, 1.02), (2, 1.2)])
 def test_rays_of_a_known_point_elsewhere_are_apart_from_those_in_the_network(rays_there: int, most: float) -> None:
     fused = Fused()
