@@ -32,8 +32,9 @@ import numba
 import numpy as np
 
 from submin.errors import InputError
-from submin.geodesy import Ellipsoid, geocentric_to_geodetic, local_axes
+from submin.geodesy import Ellipsoid
 from submin.sensors.base import Array, Ground, Index, Parameter, Projection
+from submin.sensors.straight_sight import meet
 
 DIRECTIONS = ("measured to ideal", "ideal to measured")
 """What the polynomial of a lens distortion maps, and to what."""
@@ -47,8 +48,6 @@ ORTHONORMAL = 1e-6
 NEWTON_STEPS = 30
 NEWTON_MM = 1e-8
 """A Newton step this small was the last one: what it leaves is its square."""
-LOCALISED_METRES = 1e-7
-LOCALISE_STEPS = 20
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -299,38 +298,11 @@ class FrameSensor:
 
     def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
         """See `Sensor.localise`."""
-        start, along = cameras[image, _POSITION:_ROTATION], _directions(cameras, image, samples, lines)
-        distance = _first_crossing(start, along, heights, ellipsoid)
-        reached = np.isfinite(distance)
-        distance[~reached] = 0.0
-        along[~reached] = 0.0
-        settled = np.zeros(len(image), dtype=np.bool_)
-        geodetic = np.empty((len(image), 3))
-        for _ in range(LOCALISE_STEPS):
-            geodetic = geocentric_to_geodetic(start + distance[:, None] * along, ellipsoid)
-            above = geodetic[:, 2] - heights
-            settled = np.abs(above) < LOCALISED_METRES
-            if settled[reached].all():
-                break
-            fall = np.einsum("rk,rk->r", local_axes(geodetic)[:, 2], along)
-            distance -= np.divide(above, fall, out=np.zeros_like(above), where=reached & (fall != 0.0))
-        geodetic[:, 2] = heights
-        geodetic[~(reached & settled)] = np.nan
-        return geodetic
+        return meet(cameras[image, _POSITION:_ROTATION], _directions(cameras, image, samples, lines), heights, ellipsoid)
 
     def mean_height(self, cameras: Array) -> Array:
         """The height of mean ground that each description states."""
         return cameras[:, _HEIGHT]
-
-
-def _first_crossing(start: Array, along: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
-    """Distances (r,) at which rays from outside first meet the ellipsoid whose axes are longer by these heights; NaN where they do not."""
-    radii = np.array([1.0, 1.0, 0.0]) * ellipsoid.semimajor_axis + np.array([0.0, 0.0, 1.0]) * ellipsoid.semiminor_axis + heights[:, None]
-    s, d = start / radii, along / radii
-    dd, sd, ss = (np.einsum("rk,rk->r", a, b) for a, b in ((d, d), (s, d), (s, s)))
-    with np.errstate(invalid="ignore"):
-        distance = (-sd - np.sqrt(sd**2 - dd * (ss - 1.0))) / dd
-        return np.where((distance > 0.0) & (ss > 1.0), distance, np.nan)
 
 
 def _numbers(camera: Mapping[str, Any], name: str, shape: tuple[int, ...], what: str, default: tuple[float, ...] | None = None) -> Array:
