@@ -159,7 +159,9 @@ def network_figure(network: Network, title: str | None = None) -> Figure:
 
 
 def _images(network: Network) -> _Images:
-    columns = network.snapshot.image_columns(["image_id", "footprint", "released"])
+    columns = network.snapshot.image_columns(["image_id", "sensor", "footprint", "released", "withdrawn"])
+    here = (columns["withdrawn"] == 0) & (columns["sensor"] != "survey")  # views of control points are no images
+    columns = {name: values[here] for name, values in columns.items()}
     flagged = columns["released"] == 1
     given = np.flatnonzero(columns["footprint"] != "")
     parts, image = shapely.get_parts(shapely.from_wkb(columns["footprint"][given], on_invalid="ignore"), return_index=True)

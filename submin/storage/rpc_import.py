@@ -7,7 +7,7 @@ the image's RPC.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,9 +38,7 @@ from submin.storage.catalogue_schema import (
     utc_text,
 )
 from submin.storage.catalogue_writer import CatalogueWriter
-
-PASS_GAP_SECONDS = 180.0
-"""Images of one platform further apart in time than this are of two passes."""
+from submin.storage.imports import ImportSummary, Taken, named, passes
 
 BLOCKINGS = ("pass", "image", "all")
 
@@ -50,28 +48,6 @@ _IMAGES = (
     text("pass_id", False, blank=True), text("licence", False, blank=True),
 )  # fmt: skip
 _TRACKS = (text("track_id"), text("image_id"), number("col"), number("row"))
-
-
-@dataclass(frozen=True)
-class ImportSummary:
-    """What an import has written: sizes, and notes on what was assumed or left out.
-
-    Attributes
-    ----------
-    catalogue : folder
-    dataset : name of the catalogue, prefix of its point ids
-    blocks, passes, images, points, rays : numbers of them
-    notes : one line each
-    """
-
-    catalogue: Path
-    dataset: str
-    blocks: int
-    passes: int
-    images: int
-    points: int
-    rays: int
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -161,12 +137,12 @@ def import_rpc(
     notes: list[str] = []
     seen = np.bincount(tracks.image, minlength=len(listed)) > 0
     if not seen.all():
-        notes.append(f"left out, because no track names them: {_named(i.image_id for i, s in zip(listed, seen, strict=True) if not s)}")
+        notes.append(f"left out, because no track names them: {named(i.image_id for i, s in zip(listed, seen, strict=True) if not s)}")
     kept = [i for i, s in zip(listed, seen, strict=True) if s]
     image_of = (np.cumsum(seen) - 1).astype(np.int32)
     tracks = replace(tracks, image=image_of[tracks.image])
 
-    pass_ids = _pass_ids(kept, name, notes)
+    pass_ids = passes([Taken(i.platform, i.time, i.pass_id) for i in kept], name, notes)
     block_ids = {"pass": pass_ids, "image": [i.image_id for i in kept], "all": [name] * len(kept)}[blocks]
     records = _records(images_file, Path(rpc_folder), kept, pass_ids, block_ids, tracks, notes)
     prefix = "" if shared_ids else f"{name}/"
@@ -249,26 +225,6 @@ def _read_tracks(path: Path, images_file: Path, listed: Sequence[_Listed]) -> _T
     return _Tracks(track_ids, image, col, row)
 
 
-def _pass_ids(listed: Sequence[_Listed], dataset: str, notes: list[str]) -> list[str]:
-    """Pass of each image: as the table says, else by gaps in time within a platform, else one for all images without a time."""
-    pass_ids = [image.pass_id for image in listed]
-    timed = [(image.platform, image.time, i) for i, image in enumerate(listed) if image.time and not image.pass_id]
-    last: tuple[str, datetime] | None = None
-    for platform, time, i in sorted(timed):
-        if last is None or last[0] != platform or (time - last[1]).total_seconds() > PASS_GAP_SECONDS:
-            current = f"{platform or dataset}-{time:%Y%m%dT%H%M%S}"
-        pass_ids[i], last = current, (platform, time)
-    untimed = [i for i, image in enumerate(listed) if not image.time and not image.pass_id]
-    if untimed:
-        for i in untimed:
-            pass_ids[i] = f"{dataset}-pass"
-        notes.append(
-            f"neither pass_id nor acquisition_utc is known of {len(untimed)} images of {len(listed)}: "
-            f"they are taken as one pass, {dataset}-pass"
-        )
-    return pass_ids
-
-
 def _records(
     images_file: Path,
     rpc_folder: Path,
@@ -305,13 +261,13 @@ def _records(
             )
         )  # fmt: skip
     if guessed:
-        notes.append(f"width or height is not known; the extent of the tracks stands for it: {_named(guessed)}")
+        notes.append(f"width or height is not known; the extent of the tracks stands for it: {named(guessed)}")
     if outside:
-        notes.append(f"some tracks lie outside the image, so check col0, row0, width, height: {_named(outside)}")
+        notes.append(f"some tracks lie outside the image, so check col0, row0, width, height: {named(outside)}")
     footprints = _footprints(records)
     if b"" in footprints:
         without = (record.image_id for record, footprint in zip(records, footprints, strict=True) if not footprint)
-        notes.append(f"no footprint, because the RPC cannot be inverted: {_named(without)}")
+        notes.append(f"no footprint, because the RPC cannot be inverted: {named(without)}")
     return [replace(record, footprint=footprint) for record, footprint in zip(records, footprints, strict=True)]
 
 
@@ -397,10 +353,4 @@ def _blocks(
     return blocks
 
 
-def _named(ids: Iterable[str]) -> str:
-    """The first few of some ids, and how many more."""
-    names = list(ids)
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-__all__ = ["PASS_GAP_SECONDS", "ImportSummary", "import_rpc"]
+__all__ = ["import_rpc"]

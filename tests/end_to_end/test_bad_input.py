@@ -25,6 +25,8 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 import zarr
+from isis_files import binary, isd, points
+from isis_files import write as write_isis
 from networks import accepted_rays, area_of
 
 import submin
@@ -188,6 +190,19 @@ class World:
         path.write_text(json.dumps(camera))
         return words
 
+    def isis(self, old: str = "", new: str = "") -> list[Any]:
+        """An import of an ISIS network, a text of which is replaced."""
+        network = write_isis(self.folder / "isis")
+        if old:
+            self.replace("isis/network.pvl", old, new)
+        return ["import", "isis", network, "--cameras", self.folder / "isis", "--out", self.new]
+
+    def isd(self, **changes: Any) -> list[Any]:
+        """An import of an ISIS network, one camera of which is changed."""
+        words = self.isis()
+        self.write("isis/image0.isd", json.dumps(isd(0, **changes)))
+        return words
+
     def replace(self, name: str, old: str, new: str) -> None:
         path = self.folder / name
         content = path.read_text()
@@ -225,6 +240,7 @@ simply("negative number of workers", lambda w: [*w.run(), "--workers", -1])
 simply("batches of no block", lambda w: [*w.run(), "--batch-blocks", 0])
 simply("no point at most", lambda w: ["query", w.fused, *BOX, "--max-points", 0])
 simply("unknown blocking of an import", lambda w: [*w.importing(), "--blocks", "strip"])
+simply("sigma of an import out of range", lambda w: [*w.isis(), "--sigma", 0])
 simply("scale of a simulation out of range", lambda w: ["simulate", "region", "--out", w.new, "--scale", 0])
 
 # --- the network ------------------------------------------------------------------------------------------------------------------------
@@ -490,6 +506,27 @@ changed("RPC with 19 coefficients", lambda w: w.camera(lambda c: c["LINE_NUM_COE
 changed("RPC with a scale of zero", lambda w: w.camera(lambda c: c.update(LAT_SCALE=0.0)))
 changed("RPC with a value that is not finite", lambda w: w.camera(lambda c: c.update(LINE_OFF=float("nan"))))
 changed("RPC with a value that is not a number", lambda w: w.camera(lambda c: c.update(LINE_OFF="left")))
+
+
+def framed(name: str, **changes: Any) -> None:
+    """Enter a case in which an image is said to be of a frame camera, which lacks something."""
+
+    def change(w: World) -> None:
+        w.camera(lambda c: (c.clear(), c.update({**FRAME, **changes})))
+        w.set("images", "sensor", "frame")
+
+    changed(name, change)
+
+
+FRAME = {
+    "position": [7e6, 0.0, 0.0], "rotation": [[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]], "focal_length": 3000.0,
+    "mm_to_pixel": [[5000.0, 100.0, 0.0], [5000.0, 0.0, 100.0]], "height": 0.0,
+}  # fmt: skip
+
+framed("frame camera without a place", position=None)
+framed("frame camera with a rotation that is none", rotation=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
+framed("frame camera with a distortion that says not which way", distortion={"radial": [1e-9, 0.0, 0.0]})
+framed("frame camera with a distortion that folds the image", distortion={"radial": [-1e-3, 0.0, 0.0], "direction": "measured to ideal"})
 changed("RPC with swapped axes", lambda w: w.camera(lambda c: c.update(LAT_OFF=c["LONG_OFF"], LONG_OFF=c["LAT_OFF"])))
 
 changed("priors that are not JSON", lambda w: (w.catalogue / "priors.json").write_text("bias 10"))
@@ -778,6 +815,41 @@ imported(
 imported("no such file of tracks", lambda w: (w.folder / "tracks.csv").unlink())
 imported("folder that holds something already", lambda w: shutil.copytree(w.catalogue, w.new))
 imported("file in place of a new catalogue", lambda w: w.write("new", "mine"))
+
+
+simply("ISIS network that is none", lambda w: w.isis("Object = ControlNetwork", "Object = Network"))
+simply("no such ISIS network", lambda w: [*w.isis()[:2], w.folder / "nowhere.net", *w.isis()[3:]])
+simply("ISIS network cut short", lambda w: w.isis("  End_Object\n\nEnd_Object\nEnd", ""))
+simply("ISIS network that is not PVL in a line", lambda w: w.isis("PointType = Free", "PointType ="))
+simply("ISIS network of an old version", lambda w: w.isis("Version = 5", "Version = 1"))
+simply("control point of an ISIS network without covariance", lambda w: w.isis("AprioriCovarianceMatrix", "AprioriMatrix"))
+simply("control point of an ISIS network without error", lambda w: w.isis("PointType = Constrained", "PointType = Fixed"))
+simply("unknown image in an ISIS network", lambda w: w.isis("APOLLO15/METRIC/1971-07-31T14:01", "APOLLO16/METRIC/1972-04-21T14:01"))
+simply(
+    "scale of ISIS images that is not whole", lambda w: w.isd(focal2pixel_samples=[0.0, -140.0, 0.0], focal2pixel_lines=[0.0, 0.0, 140.0])
+)
+simply("ISD of a camera that is no frame camera", lambda w: w.isd(name_model="USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"))
+simply("ISD of an unknown lens", lambda w: w.isd(name_sensor="WAC", optical_distortion={"radial": {"coefficients": [0.0, 1e-5, 0.0]}}))
+simply("ISD without a position", lambda w: w.isd(instrument_position={}))
+
+
+@case("binary ISIS network of an old version")
+def _(w: World) -> list[Any]:
+    words = w.isis()
+    w.write("isis/network.pvl", binary(points(), version="2"))
+    return words
+
+
+@case("missing ISD")
+def _(w: World) -> list[Any]:
+    words = w.isis()
+    (w.folder / "isis" / "image1.isd").unlink()
+    return words
+
+
+@case("point of an ISIS network twice in an image")
+def _(w: World) -> list[Any]:
+    return w.isis("APOLLO15/METRIC/1971-07-31T14:01", "APOLLO15/METRIC/1971-07-31T14:00")
 
 
 @case("imported coordinate that is not a number")

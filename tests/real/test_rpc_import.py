@@ -18,7 +18,8 @@ from submin.errors import CatalogueError, InputError
 from submin.geodesy import WGS84
 from submin.sensors import sensor_named
 from submin.storage.catalogue import Block, Catalogue, defects
-from submin.storage.rpc_import import ImportSummary, import_rpc
+from submin.storage.imports import ImportSummary
+from submin.storage.rpc_import import import_rpc
 
 FOLDERS = {"wv3_jax068": "rpc_raw", "pleiades_provence_triplet": "rpc", "pleiades_ventoux_pair": "rpc"}
 
