@@ -1,7 +1,7 @@
 """PVL as ISIS writes it: nested objects and groups of ``name = value``, read in one pass over the text.
 
 Values are texts, or lists of texts where the file has a sequence; units in angle brackets and comments are left out. What they mean is not
-known here. Of the whole language (CCSDS 641.0-B-2) that is what control networks use (docs/decisions/009 says why no library).
+known here. Of the whole language (CCSDS 641.0-B-2) that is what control networks use (docs/decisions/010 says why no library).
 """
 
 from __future__ import annotations
