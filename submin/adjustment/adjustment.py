@@ -1,4 +1,4 @@
-"""Adjustment of a bundle of rays: Gauss-Newton with a robust start, blunders rejected, bad cameras named.
+"""Adjustment of a bundle of rays: damped Gauss-Newton with a robust start, blunders rejected, bad cameras named.
 
 The same function serves stage 1 (one block, free of any network) and the judgement of a sub-MIN's rays (all that a tile holds). Its
 result is the accepted rays, the released cameras, and the state at which to linearise; never a dense covariance of ground points.
@@ -6,18 +6,26 @@ result is the accepted rays, the released cameras, and the state at which to lin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.blunders import bad_cameras, image_statistics, reject_blunders, residuals, robust_weights
-from submin.adjustment.elimination import LinearRays, eliminate, ground_corrections, linearise, moved_rays, point_factors
+from submin.adjustment.blunders import bad_cameras, image_statistics, noise_bound, reject_blunders, residuals, robust_weights
+from submin.adjustment.elimination import (
+    LinearRays,
+    eliminate,
+    ground_corrections,
+    linearise,
+    moved_by_ground,
+    moved_rays,
+    point_factors,
+    residuals_of,
+)
 from submin.adjustment.estimation import ImageEstimate, estimate_images
-from submin.adjustment.explained import explained_metres
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays
-from submin.errors import NumericalError
+from submin.adjustment.status import Cause, Status, UnseenGroundError, diagnose
 
 Array = NDArray[np.float64]
 
@@ -28,12 +36,22 @@ MAX_ITERATIONS = 40
 FREE_DECISIONS = 12
 """Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
 REACH_METRES = 5000.0
-"""A point is linearised no farther than this, or than its cameras explain, from where it was registered. The estimate of a weak point (rays
-of one viewpoint) may lie anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours
-to choose."""
+"""A point is linearised no farther than this from where it was registered. The estimate of a weak point (rays of one viewpoint) may lie
+anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours to choose."""
 CONVERGED_SIGMAS = 2e-6
 """A step that moves no ray by more than this, in sigmas of its measurement, is none."""
 CONVERGED_METRES = 1e-5
+PATIENCE = 4
+"""Iterations after which images are judged though decisions about rays go on: a bad camera can be why they do."""
+NEAR_SIGMAS = 0.3
+"""Images whose last step moved no ray by more are near enough to their solution to tell how sure a decision about a ray is."""
+HALVINGS = 10
+"""A step that makes matters worse is halved so many times before it is taken as it is, or not at all."""
+RUNAWAY = 4.0
+"""Factor by which a point's weighted squares, and `SLACK` of them, may exceed what a step promised before the point runs away."""
+SLACK = 100.0
+RISE = 1e-6
+"""Part of the weighted squares by which they may rise in a step: round-off."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +67,7 @@ class Adjustment:
     released : (m,) True for images whose a priori model was released because their camera is bad
     image_statistic : (m,) largest test statistic of each image against its a priori model, when it was judged bad, else the last one
     residuals : (r, 2) of the accepted rays, in sigmas, each point at its best place; NaN for rejected rays
-    converged : False when the iterations ran out
-    iterations : how many there were
+    status : whether it converged, in how many iterations, and why not
     """
 
     theta: Array
@@ -60,93 +77,171 @@ class Adjustment:
     released: NDArray[np.bool_]
     image_statistic: Array
     residuals: Array
-    converged: bool
-    iterations: int
+    status: Status
+
+    @property
+    def converged(self) -> bool:
+        """True when the last step was none and all decisions stood."""
+        return self.status.converged
+
+    @property
+    def iterations(self) -> int:
+        """Steps taken."""
+        return self.status.iterations
+
+
+@dataclass(frozen=True)
+class _State:
+    """Where an adjustment is: corrections, positions, and the rays linearised there.
+
+    ``whitened`` are the corrections' whitened vectors, None when the a priori model has changed since; ``squares`` (r,) those of the
+    residuals, in sigmas.
+    """
+
+    theta: Array
+    whitened: Array | None
+    ground: Array
+    linear: LinearRays
+    squares: Array
+
+    @classmethod
+    def at(cls, images: ImageSet, rays: Rays, theta: Array, whitened: Array | None, ground: Array) -> _State:
+        linear = linearise(images, rays, theta, ground, ground)
+        residual = linear.y - moved_rays(linear, theta)
+        return cls(theta, whitened, ground, linear, np.einsum("rc,rc->r", residual, residual))
+
+    def by_point(self, point: NDArray[np.int32], weight: Array) -> Array:
+        """Weighted squares (n,) of each point's rays; NaN where a camera does not see it."""
+        return np.bincount(point, np.where(weight > 0.0, weight * self.squares, 0.0), len(self.ground))
+
+    @property
+    def prior_squares(self) -> float:
+        return np.inf if self.whitened is None else float(self.whitened @ self.whitened)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A step: the state that it reached, the estimate that it follows, the noise found on the way, and whether it had to be shortened."""
+
+    state: _State
+    estimate: ImageEstimate
+    noise: float
+    shortened: bool
 
 
 def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None = None) -> Adjustment:
     """Adjust m images and n ground points by their rays, from ground positions ``start`` (n, 3) and unadjusted cameras.
 
-    ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within reach of it.
+    ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within `REACH_METRES` of it.
 
     Raises
     ------
+    UnseenGroundError
+        When a camera does not see a point at the start.
     NumericalError
-        When a position is not finite, or the rays' information is not finite or not positive definite.
+        When the rays' information is not finite or not positive definite.
     """
-    if not np.isfinite(start).all():
-        raise NumericalError(f"the positions of {int((~np.isfinite(start)).any(axis=1).sum())} of {len(start)} points are not finite")
-    theta = np.zeros((len(images), images.parameters))
-    ground, anchor = start.copy(), start if registered is None else registered
-    reach = _reach(images, rays, anchor)
-    # round-off of normal equations goes with the square of how much worse cameras are known than rays are measured
-    round_off = (reach.max(initial=REACH_METRES) / REACH_METRES) ** 2
+    anchor = start if registered is None else registered
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
-    iteration = 0
-    while iteration < ROBUST_ITERATIONS:
+    state = _State.at(images, rays, np.zeros((len(images), images.parameters)), np.zeros(images.prior.shape[1]), start)
+    blind = np.flatnonzero(rays.accepted & ~np.isfinite(state.squares))
+    if len(blind):
+        raise UnseenGroundError(images.ids, int(rays.image[blind[0]]), int(rays.point[blind[0]]))
+    iteration, robust = 0, 0
+    while robust < ROBUST_ITERATIONS and iteration < MAX_ITERATIONS:
         iteration += 1
-        linear, estimate, ground = _step(images, rays, theta, ground, anchor, reach, weight)
-        theta = estimate.theta
-        before, weight = weight, robust_weights(linear, np.where(_seen(linear), candidates, 0.0), theta)
-        if np.abs(weight - before).max(initial=0.0) < SETTLED_WEIGHT:
+        step = _advance(images, rays, state, anchor, weight)
+        state, robust = step.state, 0 if step.shortened else robust + 1
+        before, weight = weight, robust_weights(state.linear, candidates, state.theta)
+        if not step.shortened and np.abs(weight - before).max(initial=0.0) < SETTLED_WEIGHT:
             break
 
     weight = (weight > 0.05).astype(np.float64)
     released = np.zeros(len(images), dtype=bool)
-    image_statistic = np.zeros(len(images))
-    statistic = np.zeros(len(rays))
-    converged, judgements = False, 0
+    image_statistic, statistic = np.zeros(len(images)), np.zeros(len(rays))
+    converged, judgements, last, before = False, 0, state, weight
     while not converged and judgements < MAX_ITERATIONS:
         judgements += 1
-        linear, estimate, reached = _step(images, rays, theta, ground, anchor, reach, weight)
-        step = np.abs(moved_rays(linear, estimate.theta - theta)[_seen(linear)]).max(initial=0.0)
-        step_m = np.abs(reached - ground).max(initial=0.0)
-        theta, ground = estimate.theta, reached
-        judgeable = np.where(_seen(linear), candidates if judgements <= FREE_DECISIONS else weight, 0.0)
-        judged, statistic = reject_blunders(linear, judgeable, theta, estimate.covariance)
-        worst = image_statistics(theta, estimate.covariance, images.prior_variance)
-        # images are judged once the rays have been: a blunder must not be blamed on its camera
-        bad = bad_cameras(worst, linear) & ~released & np.array_equal(judged, weight)
-        image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
-        converged = (
-            max(step / CONVERGED_SIGMAS, step_m / CONVERGED_METRES) < round_off and not bad.any() and bool(np.array_equal(judged, weight))
+        step = _advance(images, rays, state, anchor, weight)
+        last, before, state = state, weight, step.state
+        if step.shortened:  # far from the solution nothing can be judged
+            continue
+        theta, covariance = state.theta, step.estimate.covariance
+        moved = np.abs(moved_rays(state.linear, theta - last.theta)).max(initial=0.0)
+        # while images move, what contradicts a point may be their doing: then only the likeliest blunder goes, with no doubt about it
+        judged, statistic = reject_blunders(
+            state.linear, candidates if judgements <= FREE_DECISIONS else weight, theta, covariance,
+            step.noise if moved < NEAR_SIGMAS else 0.0,
         )  # fmt: skip
+        worst = image_statistics(theta, covariance, images.prior_variance)
+        decided = bool(np.array_equal(judged, weight))
+        # images are judged once the rays have been: a blunder must not be blamed on its camera
+        bad = bad_cameras(worst, state.linear) & ~released & (decided or judgements % PATIENCE == 0)
+        image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
+        converged = decided and not bad.any() and moved < CONVERGED_SIGMAS and _points_stand(last, state, weight)
         weight, released = judged, released | bad
-        images = images.release(bad) if bad.any() else images
+        if bad.any():
+            images, state = images.release(bad), replace(state, whitened=None)
 
-    final = linearise(images, rays, theta, ground, ground)
-    return Adjustment(
-        theta, ground, weight > 0.0, statistic, released, image_statistic, residuals(final, weight, theta), converged,
-        iteration + judgements,
+    iteration += judgements
+    status = Status(Cause.CONVERGED, iteration) if converged else diagnose(
+        state.linear, weight, (state.theta - last.theta, state.ground - last.ground), weight != before, iteration, CONVERGED_SIGMAS
     )  # fmt: skip
+    final = residuals(state.linear, weight, state.theta)
+    return Adjustment(state.theta, state.ground, weight > 0.0, statistic, released, image_statistic, final, status)
 
 
-def _step(
-    images: ImageSet, rays: Rays, theta: Array, ground: Array, anchor: Array, reach: Array, weight: Array
-) -> tuple[LinearRays, ImageEstimate, Array]:
-    """One Gauss-Newton step.
+def _points_stand(last: _State, state: _State, weight: Array) -> bool:
+    """True when a step has moved no point in any way that its rays would show."""
+    shift = state.ground - last.ground
+    return bool(
+        np.abs(shift).max(initial=0.0) < CONVERGED_METRES
+        or np.abs(moved_by_ground(state.linear, shift)[weight > 0.0]).max(initial=0.0) < CONVERGED_SIGMAS
+    )
 
-    Returns the linearised rays, the images' new estimate, and the points' new positions (n, 3), within reach (n,) of their anchors. A ray
-    of a point that its camera does not see where both are now is left out of this step.
-    """
-    linear = linearise(images, rays, theta, ground, ground)
-    weight = np.where(_seen(linear), weight, 0.0)
-    estimate = estimate_images(eliminate(linear, weight, len(images)), images.prior, images.parameters)
-    offset = ground + ground_corrections(point_factors(linear, weight), linear, estimate.theta) - anchor
+
+def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, weight: Array) -> _Step:
+    """One Gauss-Newton step, points within reach of their anchors; shortened when it would make matters worse."""
+    linear = state.linear
+    sums = eliminate(linear, weight, len(images))
+    estimate = estimate_images(sums, images.prior, images.parameters)
+    factors = point_factors(linear, weight)
+    offset = state.ground + ground_corrections(factors, linear, estimate.theta) - anchor
     distance = np.linalg.norm(offset, axis=1)
-    offset *= (reach / np.maximum(distance, reach))[:, None]
-    return linear, estimate, anchor + offset
+    offset *= np.minimum(1.0, REACH_METRES / np.maximum(distance, REACH_METRES))[:, None]
+    # a point that stays, or is held back, is not where its rays want it: it does not tell whether the step was good
+    moves = weight * (factors.rank == 3)[rays.point]
+    free = moves * (distance <= REACH_METRES)[rays.point]
+    reached, shortened = _shortened(images, rays, state, moves, free, estimate, anchor + offset)
+    return _Step(reached, estimate, noise_bound(estimate.chi_square, sums.redundancy), shortened)
 
 
-def _reach(images: ImageSet, rays: Rays, anchor: Array) -> Array:
-    """Metres (n,) from its anchor within which each point is linearised: `REACH_METRES`, or what its cameras explain."""
-    projection = images.project(np.zeros((len(images), images.parameters)), images.ground(anchor), rays.image, rays.point)
-    reach = np.full(len(anchor), REACH_METRES)
-    np.maximum.at(reach, rays.point, explained_metres(projection, images.prior_variance[rays.image], rays.sigma))
-    return reach
+def _shortened(
+    images: ImageSet, rays: Rays, old: _State, moves: Array, free: Array, estimate: ImageEstimate, ground: Array
+) -> tuple[_State, bool]:
+    """The state that a step reaches, halved until the weighted squares fall: for points that run away, else for everything.
 
-
-def _seen(linear: LinearRays) -> NDArray[np.bool_]:
-    """True (r,) for rays whose camera sees the point where both were linearised."""
-    return np.asarray(np.isfinite(linear.y).all(axis=1))
+    ``moves`` (r,) are the weights of the rays whose points move, ``free`` those of the rays whose squares are to fall together. Returns
+    also whether the step was shortened.
+    """
+    theta, whitened, point = estimate.theta, estimate.whitened, rays.point
+    total = (1.0 + RISE) * (float(old.by_point(point, free).sum()) + old.prior_squares) + RISE
+    before, predicted = old.by_point(point, moves), None
+    for halvings in range(HALVINGS + 1):
+        new = _State.at(images, rays, theta, whitened, ground)
+        after = new.by_point(point, moves)
+        away = ~(after <= RUNAWAY * (before + SLACK))
+        if away.any():  # because of what was linear in the step, or because of what was not?
+            if predicted is None:
+                left = residuals_of(old.linear, theta, ground - old.ground)
+                predicted = np.bincount(point, np.where(moves > 0.0, moves * np.einsum("rc,rc->r", left, left), 0.0), len(ground))
+            away = ~(after <= RUNAWAY * (predicted + SLACK))
+        if not away.any() and float(new.by_point(point, free).sum()) + new.prior_squares <= total:
+            return new, halvings > 0
+        if away.any() and 2 * np.count_nonzero(away) < len(away):
+            ground = np.where(away[:, None], 0.5 * (old.ground + ground), ground)
+        else:
+            theta, ground = 0.5 * (old.theta + theta), 0.5 * (old.ground + ground)
+            whitened = whitened if old.whitened is None else 0.5 * (old.whitened + whitened)
+    return (new if np.isfinite(after).all() else old), True

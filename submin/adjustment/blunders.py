@@ -10,13 +10,16 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import gammaincinv, ndtri
 
 from submin.adjustment.elimination import Array, Index, LinearRays, Offsets
 from submin.adjustment.point_basis import gather, most_rays, orthonormal, remove_ground
+from submin.adjustment.snooping import snoop
 
 CRITICAL_RAY = 4.0
 """A ray whose w exceeds this is a blunder (1 good coordinate in 16,000; decision 004 says why not 3.29)."""
+DOUBT = 9.2
+"""An explanation whose weighted squares exceed the best one's by less is as good: it is one hundredth as likely, ``2 ln 100``."""
 IMAGE_FAMILY = 0.05
 """Chance that any good image of a set adjusted together is said to have a bad camera (Bonferroni over all parameters tested)."""
 TESTABLE = 0.01
@@ -57,97 +60,6 @@ def _residuals(
     return residual, variance
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _drop(variance: Array, v0: float, v1: float, testable: float) -> float:
-    """By how much the weighted squares drop when a ray with residuals v0, v1 of this covariance (2, 2) is left out: ``v' V^-1 v``.
-
-    A direction that nothing checks (variance below ``testable``) does not count.
-    """
-    mean, half = 0.5 * (variance[0, 0] + variance[1, 1]), 0.5 * (variance[0, 0] - variance[1, 1])
-    spread = np.hypot(half, variance[0, 1])
-    angle = 0.5 * np.arctan2(variance[0, 1], half)
-    along, across = np.cos(angle) * v0 + np.sin(angle) * v1, np.cos(angle) * v1 - np.sin(angle) * v0
-    drop = 0.0
-    if mean + spread >= testable:
-        drop += along * along / (mean + spread)
-    if mean - spread >= testable:
-        drop += across * across / (mean - spread)
-    return drop
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _snoop(
-    first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array,
-    theta: Array, covariance: Array, critical: float, testable: float, statistic: Array,
-) -> None:  # fmt: skip
-    """Test each point's rays, reject the worst, and again until none is left to reject.
-
-    Changes ``weight``; ``statistic`` (r,) becomes each ray's last w.
-    """
-    p = by_parameters.shape[2]
-    most = most_rays(first)
-    rays, root = np.empty(most, np.int64), np.empty(most)
-    b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
-    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
-    drops = np.empty(most)
-    row, product, variance = np.empty((2, most * p)), np.empty((2, most * p)), np.empty((2, 2))
-    for j in range(len(first) - 1):
-        while True:
-            n = gather(j, first, weight, by_ground, y, rays, root, b, t)
-            if n < 2:
-                break
-            rank = orthonormal(b, 2 * n, q, r, pivot)
-            if 2 * n <= rank:
-                break
-            for a in range(n):
-                i = rays[a]
-                for c in range(2):
-                    for u in range(p):
-                        t[2 * a + c] -= by_parameters[i, c, u] * theta[image[i], u]
-                for u in range(p):
-                    for e in range(rank):
-                        z[a, e, u] = q[2 * a, e] * by_parameters[i, 0, u] + q[2 * a + 1, e] * by_parameters[i, 1, u]
-            remove_ground(q, rank, 2 * n, t)
-            worst_w = 0.0
-            for a in range(n):
-                for c in range(2):
-                    for s in range(n):
-                        for u in range(p):
-                            value = by_parameters[rays[s], c, u] if s == a else 0.0
-                            for e in range(rank):
-                                value -= q[2 * a + c, e] * z[s, e, u]
-                            row[c, s * p + u] = value
-                    for s in range(n):
-                        at = image[rays[s]] * p
-                        for u in range(p):
-                            total = 0.0
-                            for s2 in range(n):
-                                to = image[rays[s2]] * p
-                                for v in range(p):
-                                    total += covariance[at + u, to + v] * row[c, s2 * p + v]
-                            product[c, s * p + u] = total
-                for c in range(2):
-                    for d in range(2):
-                        variance[c, d] = 1.0 if c == d else 0.0
-                        for e in range(rank):
-                            variance[c, d] -= q[2 * a + c, e] * q[2 * a + d, e]
-                        for k in range(n * p):
-                            variance[c, d] -= row[c, k] * product[d, k]
-                statistic[rays[a]] = 0.0
-                for c in range(2):
-                    if variance[c, c] >= testable:
-                        statistic[rays[a]] = max(statistic[rays[a]], abs(t[2 * a + c]) / np.sqrt(variance[c, c]))
-                worst_w = max(worst_w, statistic[rays[a]])
-                drops[a] = _drop(variance, t[2 * a], t[2 * a + 1], testable)
-            if not worst_w > critical:
-                break
-            if n == 2:  # two rays cannot be told apart: the point goes
-                weight[rays[0]] = weight[rays[1]] = 0.0
-                statistic[rays[0]] = statistic[rays[1]] = worst_w
-            else:
-                weight[rays[np.argmax(drops[:n])]] = 0.0
-
-
 def robust_weights(linear: LinearRays, weight: Array, theta: Array) -> Array:
     """Cauchy weights (r,) of rays from their residuals at these image corrections (m, p); rejected rays (weight 0) stay rejected."""
     residual, variance = _residuals(
@@ -164,7 +76,7 @@ def residuals(linear: LinearRays, weight: Array, theta: Array) -> Array:
     return np.asarray(_residuals(linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta)[0])
 
 
-def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance: Array) -> tuple[Array, Array]:
+def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance: Array, noise: float = 1.0) -> tuple[Array, Array]:
     """Weights (r,) of the rays, 0 for blunders, and the test statistic (r,) of each, at an adjustment of the images.
 
     Parameters
@@ -178,11 +90,23 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
     weighted squares drop most, and the rest are tested again. Of two rays that contradict each other both go.
     """
     judged, statistic = weight.copy(), np.zeros(len(weight))
-    _snoop(
+    snoop(
         linear.first, linear.image, judged, linear.by_ground, linear.by_parameters, linear.y,
-        theta, covariance, CRITICAL_RAY, TESTABLE, statistic,
+        theta, covariance, CRITICAL_RAY, DOUBT * noise, TESTABLE, statistic,
     )  # fmt: skip
     return judged, statistic
+
+
+def noise_bound(chi_square: float, redundancy: int) -> float:
+    """Upper bound of the variance of measurements in units of the stated one (95 %), at most 1, from an adjustment's weighted squares.
+
+    Examples
+    --------
+    >>> [round(noise_bound(0.1 * redundancy, redundancy), 3) for redundancy in (0, 1, 10, 1000)]
+    [1.0, 1.0, 0.254, 0.108]
+    """
+    least = 2.0 * gammaincinv(0.5 * redundancy, 0.05) if redundancy > 0 else 0.0
+    return float(min(1.0, chi_square / least)) if least > 0.0 else 1.0
 
 
 def image_statistics(theta: Array, covariance: Array, prior_variance: Array) -> Array:

@@ -234,8 +234,12 @@ def moved_rays(linear: LinearRays, theta: Array) -> Array:
     return np.asarray(np.einsum("rcp,rp->rc", linear.by_parameters, theta[linear.image]))
 
 
+def moved_by_ground(linear: LinearRays, correction: Array) -> Array:
+    """By how much (r, 2), in sigmas, shifts (n, 3) of the points in metres move the image coordinates of their rays."""
+    point = np.repeat(np.arange(len(correction)), np.diff(linear.first))
+    return np.asarray(np.einsum("rck,rk->rc", linear.by_ground, correction[point]))
+
+
 def residuals_of(linear: LinearRays, theta: Array, correction: Array) -> Array:
     """Linear residuals (r, 2) in sigmas of all rays at image corrections (m, p) and ground corrections ``x - x0`` (n, 3)."""
-    point = np.repeat(np.arange(len(correction)), np.diff(linear.first))
-    residual = linear.y - moved_rays(linear, theta)
-    return np.asarray(residual - np.einsum("rck,rk->rc", linear.by_ground, correction[point]))
+    return np.asarray(linear.y - moved_rays(linear, theta) - moved_by_ground(linear, correction))

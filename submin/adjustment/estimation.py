@@ -23,12 +23,14 @@ class ImageEstimate:
     Attributes
     ----------
     theta : (m, p) corrections
+    whitened : (q,) the same as whitened vectors, ``theta = K u``
     chi_square : weighted sum of squares of residuals, a priori model included
     factor : (q, q) lower Cholesky factor of the information about the whitened vectors u
     prior : (m p, q) a priori factor K
     """
 
     theta: Array
+    whitened: Array
     chi_square: float
     factor: Array
     prior: sp.csr_array
@@ -105,10 +107,10 @@ def estimate_images(sums: Sums, prior: sp.csr_array, parameters: int) -> ImageEs
     if not np.isfinite(sums.vector).all():
         raise NumericalError(f"the right-hand side of {len(sums.vector)} image parameters is not finite; a camera or a position is not")
     if not prior.shape[1]:  # only images that have nothing to adjust
-        return ImageEstimate(np.zeros((len(sums.vector) // parameters, parameters)), sums.misclosure, np.empty((0, 0)), prior)
+        return ImageEstimate(np.zeros((len(sums.vector) // parameters, parameters)), np.empty(0), sums.misclosure, np.empty((0, 0)), prior)
     factor = cholesky(reduced_information(sums.information, prior))
     right = prior.T @ sums.vector
     u, _ = la.lapack.dpotrs(factor, right, lower=1)
     theta = np.asarray(prior @ u).reshape(-1, parameters)
     # f + |u|^2 at the minimum equals f - h'theta
-    return ImageEstimate(theta, float(sums.misclosure - sums.vector @ theta.ravel()), factor, prior)
+    return ImageEstimate(theta, u, float(sums.misclosure - sums.vector @ theta.ravel()), factor, prior)
