@@ -42,7 +42,8 @@ CONVERGED_SIGMAS = 2e-6
 """A step that moves no ray by more than this, in sigmas of its measurement, is none."""
 CONVERGED_METRES = 1e-5
 PATIENCE = 4
-"""Iterations after which images are judged though decisions about rays go on: a bad camera can be why they do."""
+RESTLESS = 0.05
+"""When after so many iterations decisions still change about this part of the rays, images are judged: a bad camera may be why."""
 NEAR_SIGMAS = 0.3
 """Images whose last step moved no ray by more are near enough to their solution to tell how sure a decision about a ray is."""
 HALVINGS = 10
@@ -50,6 +51,9 @@ HALVINGS = 10
 RUNAWAY = 4.0
 """Factor by which a point's weighted squares, and `SLACK` of them, may exceed what a step promised before the point runs away."""
 SLACK = 100.0
+PROMISED = 1.1
+"""Factor by which the weighted squares may exceed what a step promised, when they do not fall: points that are not determined, and the a
+priori model, have their part in what it does."""
 RISE = 1e-6
 """Part of the weighted squares by which they may rise in a step: round-off."""
 
@@ -177,7 +181,9 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         worst = image_statistics(theta, covariance, images.prior_variance)
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
-        bad = bad_cameras(worst, state.linear) & ~released & (decided or judgements % PATIENCE == 0)
+        restless = judgements % PATIENCE == 0 and np.count_nonzero(judged != weight) > RESTLESS * len(rays)
+        bad = bad_cameras(worst, state.linear) & ~released & (decided or restless)
+        bad &= 2 * np.count_nonzero(released | bad) <= len(images)  # without most of their priors images could say anything
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
         converged = decided and not bad.any() and moved < CONVERGED_SIGMAS and _points_stand(last, state, weight)
         weight, released = judged, released | bad
@@ -227,17 +233,16 @@ def _shortened(
     """
     theta, whitened, point = estimate.theta, estimate.whitened, rays.point
     total = (1.0 + RISE) * (float(old.by_point(point, free).sum()) + old.prior_squares) + RISE
-    before, predicted = old.by_point(point, moves), None
+    before = old.by_point(point, moves)
     for halvings in range(HALVINGS + 1):
         new = _State.at(images, rays, theta, whitened, ground)
-        after = new.by_point(point, moves)
-        away = ~(after <= RUNAWAY * (before + SLACK))
-        if away.any():  # because of what was linear in the step, or because of what was not?
-            if predicted is None:
-                left = residuals_of(old.linear, theta, ground - old.ground)
-                predicted = np.bincount(point, np.where(moves > 0.0, moves * np.einsum("rc,rc->r", left, left), 0.0), len(ground))
-            away = ~(after <= RUNAWAY * (predicted + SLACK))
-        if not away.any() and float(new.by_point(point, free).sum()) + new.prior_squares <= total:
+        after, left = new.by_point(point, moves), float(new.by_point(point, free).sum())
+        away, falls = ~(after <= RUNAWAY * (before + SLACK)), left + new.prior_squares <= total
+        if away.any() or not falls:  # because of what the step has promised, or because the promise does not hold?
+            promised = replace(old, squares=np.square(residuals_of(old.linear, theta, ground - old.ground)).sum(axis=1))
+            away = ~(after <= RUNAWAY * (promised.by_point(point, moves) + SLACK))
+            falls = falls or left <= PROMISED * float(promised.by_point(point, free).sum()) + RISE
+        if falls and not away.any():
             return new, halvings > 0
         if away.any() and 2 * np.count_nonzero(away) < len(away):
             ground = np.where(away[:, None], 0.5 * (old.ground + ground), ground)

@@ -112,6 +112,43 @@ def explain(variance: Array, residual: Array, n: int, critical: float, doubt: fl
 
 
 @numba.njit(cache=True, error_model="numpy")
+def residual_rows(
+    n: int, rays: Offsets, root: Array, image: Index, by_parameters: Array, q: Array, rank: int, covariance: Array,
+    z: Array, row: Array, product: Array, free: Array,
+) -> None:  # fmt: skip
+    """What the n rays of a point say of the images once the point is gone, ``row = P A`` (2 n, n p), and the variances of its residuals.
+
+    ``product = row M`` with M the images' covariance, ``free = diag(P - row M row')`` (2 n): the redundancy numbers of the coordinates.
+    """
+    p = by_parameters.shape[2]
+    for a in range(n):
+        for u in range(p):
+            for e in range(rank):
+                z[a, e, u] = root[a] * (q[2 * a, e] * by_parameters[rays[a], 0, u] + q[2 * a + 1, e] * by_parameters[rays[a], 1, u])
+    for k in range(2 * n):
+        a, c = k // 2, k % 2
+        free[k] = 1.0
+        for e in range(rank):
+            free[k] -= q[k, e] ** 2
+        for s in range(n):
+            for u in range(p):
+                value = root[a] * by_parameters[rays[s], c, u] if s == a else 0.0
+                for e in range(rank):
+                    value -= q[k, e] * z[s, e, u]
+                row[k, s * p + u] = value
+        for s in range(n):
+            at = image[rays[s]] * p
+            for u in range(p):
+                total = 0.0
+                for s2 in range(n):
+                    to = image[rays[s2]] * p
+                    for x in range(p):
+                        total += covariance[at + u, to + x] * row[k, s2 * p + x]
+                product[k, s * p + u] = total
+                free[k] -= total * row[k, s * p + u]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def snoop(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array,
     theta: Array, covariance: Array, critical: float, doubt: float, testable: float, statistic: Array,
@@ -126,7 +163,7 @@ def snoop(
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
     row, product, variance = np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((2 * most, 2 * most))
-    blunder = np.empty(most, np.bool_)
+    free, blunder = np.empty(2 * most), np.empty(most, np.bool_)
     for j in range(len(first) - 1):
         while True:
             n = gather(j, first, weight, by_ground, y, rays, root, b, t)
@@ -140,34 +177,12 @@ def snoop(
                 for c in range(2):
                     for u in range(p):
                         t[2 * a + c] -= by_parameters[i, c, u] * theta[image[i], u]
-                for u in range(p):
-                    for e in range(rank):
-                        z[a, e, u] = q[2 * a, e] * by_parameters[i, 0, u] + q[2 * a + 1, e] * by_parameters[i, 1, u]
             remove_ground(q, rank, 2 * n, t)
             worst = 0.0
+            residual_rows(n, rays, root, image, by_parameters, q, rank, covariance, z, row, product, free)
             for k in range(2 * n):
-                a, c = k // 2, k % 2
-                free = 1.0
-                for e in range(rank):
-                    free -= q[k, e] ** 2
-                for s in range(n):
-                    for u in range(p):
-                        value = by_parameters[rays[s], c, u] if s == a else 0.0
-                        for e in range(rank):
-                            value -= q[k, e] * z[s, e, u]
-                        row[k, s * p + u] = value
-                for s in range(n):
-                    at = image[rays[s]] * p
-                    for u in range(p):
-                        total = 0.0
-                        for s2 in range(n):
-                            to = image[rays[s2]] * p
-                            for x in range(p):
-                                total += covariance[at + u, to + x] * row[k, s2 * p + x]
-                        product[k, s * p + u] = total
-                        free -= total * row[k, s * p + u]
-                w = abs(t[k]) / np.sqrt(free) if free >= testable else 0.0
-                statistic[rays[a]] = w if c == 0 else max(statistic[rays[a]], w)
+                w = abs(t[k]) / np.sqrt(free[k]) if free[k] >= testable else 0.0
+                statistic[rays[k // 2]] = w if k % 2 == 0 else max(statistic[rays[k // 2]], w)
                 worst = max(worst, w)
             if not worst > critical:
                 break

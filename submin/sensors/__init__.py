@@ -5,11 +5,14 @@ from collections.abc import Iterable
 from submin.errors import InputError
 from submin.sensors.base import Ground, Parameter, Projection, Sensor
 from submin.sensors.frame import FrameSensor
+from submin.sensors.height import HeightSensor
 from submin.sensors.pushbroom import PushbroomSensor
 from submin.sensors.rpc import RpcSensor
 from submin.sensors.survey import SurveySensor
 
-SENSORS: dict[str, Sensor] = {sensor.name: sensor for sensor in (RpcSensor(), PushbroomSensor(), FrameSensor(), SurveySensor())}
+SENSORS: dict[str, Sensor] = {
+    sensor.name: sensor for sensor in (RpcSensor(), PushbroomSensor(), FrameSensor(), SurveySensor(), HeightSensor())
+}
 
 
 def width_of(sensors: Iterable[str]) -> int:

@@ -188,10 +188,12 @@ def test_a_blunder_is_not_blamed_on_its_camera(seed: int, tile_km: float, overla
     assert named[0] <= named[1]
 
 
-@pytest.mark.xfail(strict=True, reason="a known limit: docs/decisions/004-blunders-and-bad-cameras.md, caveats")
-@pytest.mark.parametrize("seed", [2, 12])
+@pytest.mark.parametrize("seed", [12, pytest.param(2, marks=pytest.mark.xfail(strict=True, reason="two in a point: docs/decisions/004"))])
 def test_a_blunder_that_three_rays_cannot_locate_does_not_stay(seed: int, tmp_path: Path) -> None:
-    """One blunder in fifty rays, some of them along the track in points of one triplet, where all three rays look equally bad."""
+    """One blunder in fifty rays, some of them along the track in points of one triplet, where all three rays look equally bad.
+
+    With seed 2 such a point has two of them, and what the first one leaves are two rays that meet: a known limit.
+    """
     design = DESIGNS["cameras known to half a pixel"]
     found = outcome(replace(design, seed=seed, blunder_rate=0.02), tmp_path)
     region = found.region

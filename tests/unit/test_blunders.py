@@ -128,10 +128,10 @@ def test_a_planted_blunder_is_found_and_only_it(rays: int, shift: tuple[float, f
         assert statistic[planted] > CRITICAL_RAY
 
 
-@pytest.mark.parametrize(("rays", "share"), [(3, 0.9), (4, 0.99), (6, 0.99)])
-def test_the_direction_of_a_blunder_does_not_hide_whose_it_is(rays: int, share: float) -> None:
-    # One blunder in every point, at the images' true corrections. The two coordinates of a ray are wrong together: tested together
-    # (two degrees of freedom) they name the ray in 96 of 100 points of three rays and in all of four; one by one in 80 and 95.
+@pytest.mark.parametrize(("rays", "share"), [(3, 0.84), (4, 0.99), (6, 0.99)])
+def test_a_blunder_is_located_or_takes_its_point_along(rays: int, share: float) -> None:
+    # One blunder of 40 sigmas in every point, in any direction, at the images' true corrections. Two rays' blunders look alike when they
+    # are along the epipolar line that the two share: with three rays that is 15 of 100 directions, and there no ray is blamed for another.
     simulation = simulate(18, points(rays, of_each=600))
     rng = np.random.default_rng(1)
     planted = simulation.linear.first[:-1] + rng.integers(0, rays, 600)
@@ -140,8 +140,90 @@ def test_the_direction_of_a_blunder_does_not_hide_whose_it_is(rays: int, share: 
     covariance = estimate(simulation).covariance
     weight, _ = reject_blunders(moved.linear, np.ones(len(moved.linear.image)), simulation.theta, covariance)
     is_planted = np.isin(np.arange(len(weight)), planted)
-    found_and_only_it = ((weight == 0.0) == is_planted).reshape(600, rays).all(axis=1)
-    assert found_and_only_it.mean() > share
+    assert (weight[planted] == 0.0).all()
+    assert ((weight == 0.0) == is_planted).reshape(600, rays).all(axis=1).mean() > share
+
+
+def one_orbit(seed: int, count: int) -> Simulation:
+    """Points of three rays of one orbit plane: forward, down and backward along the track."""
+    simulation = simulate(seed, points(3, of_each=count), images=3)
+    by_ground = simulation.linear.by_ground.copy()
+    by_ground[:, :, 2] = -2.0 * np.array([[0.0, 0.5], [0.0, 0.02], [0.0, -0.45]])[simulation.linear.image]
+    linear = replace(simulation.linear, by_ground=by_ground, y=np.random.default_rng(seed).normal(size=simulation.linear.y.shape))
+    return replace(simulation, linear=linear, theta=np.zeros((3, P)))
+
+
+def squares_without(simulation: Simulation, point: int, out: tuple[int, ...]) -> float:
+    """Squares of the residuals of a point's rays at its best place, some left out, the images without error."""
+    rows = np.delete(np.arange(simulation.linear.first[point], simulation.linear.first[point + 1]), out)
+    b, y = simulation.linear.by_ground[rows].reshape(-1, 3), simulation.linear.y[rows].ravel()
+    left = y - b @ np.linalg.lstsq(b, y, rcond=None)[0]
+    return float(left @ left)
+
+
+def test_three_rays_of_one_orbit_plane_cannot_tell_whose_a_blunder_along_the_track_is() -> None:
+    """What decision 004 proves: whichever ray goes, the squares of the others are those of noise, and the same for all blunders."""
+    for shift in (0.0, 20.0, 200.0):
+        simulation = one_orbit(19, 200).moved({3 * j + j % 3: (0.0, shift) for j in range(200)})
+        squares = np.array([[squares_without(simulation, j, (a,)) for a in range(3)] for j in range(200)])
+        if shift == 0.0:
+            noise = squares
+        np.testing.assert_allclose(squares, noise, rtol=0.0, atol=1e-9)
+        assert np.mean(squares) == pytest.approx(1.0, abs=0.3), "chi-square of one degree of freedom"
+    found = estimate(simulation)
+    weight, _ = reject_blunders(simulation.linear, np.ones(600), np.zeros((3, P)), 1e-6 * found.covariance)
+    assert not weight.any(), "so no ray of them stays"
+
+
+def test_the_second_of_two_blunders_of_three_rays_can_hide() -> None:
+    """One across and one along the track: once the first ray has gone, the other two meet as well as good ones do."""
+    simulation = one_orbit(20, 100).moved({3 * j: (60.0, 0.0) for j in range(100)} | {3 * j + 2: (0.0, 60.0) for j in range(100)})
+    clean = one_orbit(20, 100)
+    for j in range(100):
+        assert squares_without(simulation, j, (0,)) == pytest.approx(squares_without(clean, j, (0,)), abs=1e-9)
+    weight, _ = reject_blunders(simulation.linear, np.ones(300), np.zeros((3, P)), 1e-6 * estimate(simulation).covariance)
+    weight = weight.reshape(-1, 3)
+    assert not weight[:, 0].any() and (weight[:, 2] == 1.0).mean() > 0.9
+
+
+def test_a_good_ray_is_not_taken_for_one_of_two_blunders() -> None:
+    # the ray whose loss drops the squares most can be a good one that two blunders pull away from
+    simulation = simulate(21, points(5, of_each=400))
+    rng = np.random.default_rng(2)
+    moved, planted = {}, np.zeros((400, 5), dtype=bool)
+    for j in range(400):
+        for place in rng.choice(5, 2, replace=False):
+            angle = rng.uniform(0.0, 2.0 * np.pi)
+            moved[simulation.ray(j, int(place))] = (40.0 * np.cos(angle), 40.0 * np.sin(angle))
+            planted[j, place] = True
+    covariance = estimate(simulation).covariance
+    weight, _ = reject_blunders(simulation.moved(moved).linear, np.ones(2000), simulation.theta, covariance)
+    gone = weight.reshape(400, 5) == 0.0
+    assert (gone[planted].mean(), gone[~planted].mean()) == (1.0, pytest.approx(0.0, abs=0.05))
+
+
+def test_rays_of_many_images_are_told_one_after_another() -> None:
+    # more sets of two of 24 rays than are tried
+    simulation = simulate(22, np.full(40, 24, dtype=np.int64), images=24)
+    rng = np.random.default_rng(3)
+    planted = [simulation.ray(j, int(place)) for j in range(40) for place in np.sort(rng.choice(24, 3, replace=False))]
+    moved = simulation.moved({row: tuple(40.0 * rng.choice([-1.0, 1.0], 2)) for row in planted})
+    weight, _ = reject_blunders(moved.linear, np.ones(960), simulation.theta, estimate(simulation).covariance)
+    assert np.flatnonzero(weight == 0.0).tolist() == planted
+
+
+def test_less_noise_leaves_less_doubt() -> None:
+    simulation = simulate(23, points(3, of_each=600))
+    rng = np.random.default_rng(4)
+    angle = rng.uniform(0.0, 2.0 * np.pi, 600)
+    quiet = replace(simulation.linear, y=np.zeros_like(simulation.linear.y))
+    moved = replace(simulation, linear=quiet).moved({3 * j: (40.0 * np.cos(a), 40.0 * np.sin(a)) for j, a in enumerate(angle)})
+    covariance = estimate(simulation).covariance
+    located = [
+        (reject_blunders(moved.linear, np.ones(1800), np.zeros((6, P)), covariance, noise)[0].reshape(600, 3) == [0, 1, 1]).all(axis=1).mean()
+        for noise in (1.0, 0.1, 0.01)
+    ]  # fmt: skip
+    assert located[0] < 0.9 < located[1] < located[2]
 
 
 def test_two_blunders_of_a_point_both_go() -> None:

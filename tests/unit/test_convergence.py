@@ -1,0 +1,175 @@
+"""How an adjustment gets to its solution from far away, and what it says when there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from unit.test_adjustment import CENTRE, FIVE, Array, P, Simulated, adjusted, image_set, simulate
+
+from submin.adjustment import adjustment, blunders
+from submin.adjustment.adjustment import Adjustment, adjust
+from submin.adjustment.images import ImageSet
+from submin.adjustment.intersection import intersect
+from submin.adjustment.priors import APriori, ImagePrior
+from submin.adjustment.rays import Rays, sorted_rays
+from submin.adjustment.status import Cause, UnseenGroundError
+from submin.errors import NumericalError
+from submin.geodesy import Ellipsoid, geodetic_to_geocentric, local_axes
+from submin.sensors import SENSORS, Ground, Parameter, Projection
+
+FOCAL = 1000.0
+
+
+class ScanSensor:
+    """A panoramic camera in an aircraft: image coordinates are angles, so what is far aside hardly moves. Nothing behind it is seen."""
+
+    name = "scan"
+    unit = "pixel"
+    parameters = (Parameter("sample bias", "px", "bias", 2.0), Parameter("line bias", "px", "bias", 2.0))
+
+    def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
+        return np.concatenate([camera["position"], np.ravel(camera["axes"])])
+
+    def project(self, cameras: Array, parameters: Array, ground: Ground, image: Any, point: Any, at: Array | None = None) -> Projection:
+        axes = cameras[image, 3:].reshape(-1, 3, 3)
+        x, y, depth = np.einsum("rck,rk->cr", axes, ground.geocentric[point] - cameras[image, :3])
+        predicted, by_ground = np.empty((len(image), 2)), np.empty((len(image), 2, 3))
+        with np.errstate(invalid="ignore"):
+            depth = np.where(depth > 0.0, depth, np.nan)
+        for c, aside in enumerate((x, y)):
+            predicted[:, c] = FOCAL * np.arctan(aside / depth) + parameters[image, c]
+            by_ground[:, c] = FOCAL * (axes[:, c] * depth[:, None] - axes[:, 2] * aside[:, None]) / (depth**2 + aside**2)[:, None]
+        return Projection(predicted, by_ground, np.tile(np.eye(2), (len(image), 1, 1)))
+
+    def localise(self, cameras: Array, image: Any, samples: Array, lines: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
+        return np.full((len(image), 3), np.nan)
+
+    def mean_height(self, cameras: Array) -> Array:
+        return np.zeros(len(cameras))
+
+
+@pytest.fixture
+def flight(monkeypatch: pytest.MonkeyPatch) -> Simulated:
+    """Four panoramic images 300 m above 30 points."""
+    monkeypatch.setitem(SENSORS, "scan", ScanSensor())
+    monkeypatch.setattr(blunders, "IMAGE_FAMILY", 1e-9)
+    rng, origin = np.random.default_rng(1), geodetic_to_geocentric(CENTRE[None])[0]
+    east, north, up = local_axes(CENTRE[None])[0]
+    places = [origin + 300.0 * up + a * east + b * north for a, b in ((-150, -100), (150, -100), (-150, 100), (150, 100))]
+    cameras = np.stack([ScanSensor().pack({"position": place, "axes": [east, -north, -up]}, 1, 1) for place in places])
+    priors = tuple(ImagePrior(f"b{i}", f"p{i}", 0.0, APriori(bias_px=2.0, common_to_pass=0.0), ScanSensor.parameters) for i in range(4))
+    images = ImageSet(tuple("abcd"), ("scan",) * 4, cameras, priors, 2)
+    ground = origin + rng.uniform(-200.0, 200.0, (30, 2)) @ np.stack([east, north]) + rng.uniform(-20.0, 20.0, (30, 1)) * up
+    point, image = np.repeat(np.arange(30, dtype=np.int32), 4), np.tile(np.arange(4, dtype=np.int32), 30)
+    theta = rng.normal(0.0, 1.0, (4, 2))
+    observed = images.project(theta, images.ground(ground), image, point).image + rng.normal(0.0, 0.3, (120, 2))
+    rays = sorted_rays(point, image, observed, np.full((120, 2), 0.3), np.ones(120, dtype=np.bool_))
+    return Simulated(images, rays, ground, theta)
+
+
+def started_aside(flight: Simulated, metres: float) -> Adjustment:
+    east = local_axes(CENTRE[None])[0, 0]
+    return adjust(flight.images, flight.rays, flight.ground + metres * east)
+
+
+def test_near_the_solution_no_step_is_shortened(flight: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
+    near = started_aside(flight, 1.0)
+    monkeypatch.setattr(adjustment, "HALVINGS", 0)
+    assert near.converged and near.iterations == started_aside(flight, 1.0).iterations < 12
+    assert near.accepted.all() and np.abs(near.ground - flight.ground).max() < 3.0
+
+
+@pytest.mark.parametrize("metres", [600.0, 1500.0])
+def test_a_bad_start_is_overcome(flight: Simulated, metres: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    near, far = started_aside(flight, 1.0), started_aside(flight, metres)
+    assert far.status.cause is Cause.CONVERGED and far.accepted.all()
+    np.testing.assert_allclose(far.ground, near.ground, rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(far.theta, near.theta, rtol=0.0, atol=1e-5)
+    # where whole steps are taken as they come there is no way back
+    monkeypatch.setattr(adjustment, "_shortened", whole)
+    with pytest.raises(NumericalError, match="not finite"):
+        started_aside(flight, metres)
+
+
+def whole(images: ImageSet, rays: Rays, old: Any, moves: Array, free: Array, estimate: Any, ground: Array) -> tuple[Any, bool]:
+    """Gauss-Newton as it is."""
+    return adjustment._State.at(images, rays, estimate.theta, estimate.whitened, ground), False
+
+
+def test_one_wild_point_does_not_hold_up_the_others(flight: Simulated) -> None:
+    start = flight.ground.copy()
+    start[4] += 1500.0 * local_axes(CENTRE[None])[0, 0]
+    result = adjust(flight.images, flight.rays, start)
+    assert result.converged and result.iterations < 20
+    assert np.abs(result.ground - flight.ground).max() < 3.0
+
+
+def test_a_camera_that_does_not_see_the_ground_is_named(flight: Simulated) -> None:
+    up = local_axes(CENTRE[None])[0, 2]
+    start = flight.ground.copy()
+    start[7] += 400.0 * up
+    with pytest.raises(UnseenGroundError, match=r"image a: its camera does not see the ground at point number 7; check the camera model") as raised:
+        adjust(flight.images, flight.rays, start)
+    message = raised.value.status.message(flight.images.ids, [f"P{j}" for j in range(30)])
+    assert message == "image a: its camera does not see the ground at point P7; check the camera model and the axis order"
+
+
+def finite(result: Adjustment) -> bool:
+    used = result.accepted
+    return bool(all(np.isfinite(x).all() for x in (result.theta, result.ground, result.statistic, result.image_statistic, result.residuals[used])))
+
+
+def named(block: Simulated, result: Adjustment) -> str:
+    return result.status.message(block.images.ids, [f"P{j}" for j in range(len(block.ground))])
+
+
+def test_a_good_block_converges() -> None:
+    block = simulate(1)
+    result = adjusted(block)
+    assert result.status.cause is Cause.CONVERGED
+    assert named(block, result) == f"converged in {result.iterations} iterations"
+
+
+def test_rays_of_nothing_agree_on_nothing() -> None:
+    block = simulate(2, images=image_set(FIVE))
+    rng = np.random.default_rng(1)
+    nonsense = replace(block, rays=replace(block.rays, observed=rng.uniform(0.0, 10000.0, block.rays.observed.shape)))
+    result = adjusted(nonsense)
+    assert finite(result)
+    assert result.accepted.mean() < 0.5
+    assert result.converged or result.status.cause is Cause.FEW_AGREE
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-9, 1e-6, 1e-4])
+def test_two_images_of_one_viewpoint_give_no_nonsense(apart: float) -> None:
+    block = simulate(3, images=image_set(((0.2, 0.1), (0.2 + apart, 0.1)), APriori(2.0, 1.0, 0.0)))
+    result = adjusted(block)
+    assert finite(result)
+    assert result.converged, named(block, result)
+    start = intersect(block.images, block.rays, len(block.ground)).geocentric
+    assert np.linalg.norm(result.ground - start, axis=1).max() < adjustment.REACH_METRES + 1.0
+
+
+def test_a_camera_gone_mad_is_named() -> None:
+    """Whatever the last step was, the message names an image or a point, and what to do."""
+    block = simulate(4)
+    observed = block.rays.observed.copy()
+    observed[block.rays.image == 1] = observed[block.rays.image == 1][::-1]
+    result = adjusted(replace(block, rays=replace(block.rays, observed=observed)))
+    assert finite(result)
+    if not result.converged:
+        assert any(word in named(block, result) for word in ("check", "remove", "add"))
+
+
+def test_most_images_keep_their_priors() -> None:
+    # cameras that are all three wrong: with all of them released every residual would vanish, and all points fall into one
+    images = image_set(a_priori=APriori(0.5, 0.02, 0.0))
+    theta = np.random.default_rng(3).normal(size=(3, P)) * [20.0, 5.0, 5.0, 20.0, 5.0, 5.0]
+    block = simulate(5, images=images, theta=theta)
+    result = adjusted(block)
+    assert result.converged and np.count_nonzero(result.released) <= 1
+    assert np.abs(result.theta[:, [1, 2, 4, 5]]).max() < 30.0
