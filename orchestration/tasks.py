@@ -18,6 +18,7 @@ from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
+from submin.adjustment.status import UnseenGroundError
 from submin.errors import SubminError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
@@ -131,12 +132,11 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
             return BlockAdjustment(block.block_id, accepted, None)
         result = adjust(images, rays, start.geocentric)
         if not result.converged:
-            return BlockAdjustment(
-                block.block_id, accepted,
-                f"the adjustment of the block did not converge in {result.iterations} iterations; check its cameras and measurements",
-            )  # fmt: skip
+            return BlockAdjustment(block.block_id, accepted, result.status.message(images.ids, ids))
         accepted[order] = result.accepted
         return BlockAdjustment(block.block_id, accepted, None)
+    except UnseenGroundError as error:
+        return BlockAdjustment(block.block_id, accepted, error.status.message(images.ids, ids))
     except SubminError as error:
         return BlockAdjustment(block.block_id, accepted, str(error))
 
