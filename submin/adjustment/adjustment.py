@@ -54,6 +54,8 @@ SLACK = 100.0
 PROMISED = 1.1
 """Factor by which the weighted squares may exceed what a step promised, when they do not fall: points that are not determined, and the a
 priori model, have their part in what it does."""
+UNSEEN = 1e200
+"""Squares of a residual that is no number."""
 RISE = 1e-6
 """Part of the weighted squares by which they may rise in a step: round-off."""
 
@@ -99,7 +101,7 @@ class _State:
     """Where an adjustment is: corrections, positions, and the rays linearised there.
 
     ``whitened`` are the corrections' whitened vectors, None when the a priori model has changed since; ``squares`` (r,) those of the
-    residuals, in sigmas.
+    residuals, in sigmas, `UNSEEN` where a camera does not see its point.
     """
 
     theta: Array
@@ -112,11 +114,7 @@ class _State:
     def at(cls, images: ImageSet, rays: Rays, theta: Array, whitened: Array | None, ground: Array) -> _State:
         linear = linearise(images, rays, theta, ground, ground)
         residual = linear.y - moved_rays(linear, theta)
-        return cls(theta, whitened, ground, linear, np.einsum("rc,rc->r", residual, residual))
-
-    def by_point(self, point: NDArray[np.int32], weight: Array) -> Array:
-        """Weighted squares (n,) of each point's rays; NaN where a camera does not see it."""
-        return np.bincount(point, np.where(weight > 0.0, weight * self.squares, 0.0), len(self.ground))
+        return cls(theta, whitened, ground, linear, np.fmin(np.einsum("rc,rc->r", residual, residual), UNSEEN))
 
     @property
     def prior_squares(self) -> float:
@@ -149,7 +147,7 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
     state = _State.at(images, rays, np.zeros((len(images), images.parameters)), np.zeros(images.prior.shape[1]), start)
-    blind = np.flatnonzero(rays.accepted & ~np.isfinite(state.squares))
+    blind = np.flatnonzero(rays.accepted & (state.squares >= UNSEEN))
     if len(blind):
         raise UnseenGroundError(images.ids, int(rays.image[blind[0]]), int(rays.point[blind[0]]))
     iteration, robust = 0, 0
@@ -231,17 +229,21 @@ def _shortened(
     ``moves`` (r,) are the weights of the rays whose points move, ``free`` those of the rays whose squares are to fall together. Returns
     also whether the step was shortened.
     """
-    theta, whitened, point = estimate.theta, estimate.whitened, rays.point
-    total = (1.0 + RISE) * (float(old.by_point(point, free).sum()) + old.prior_squares) + RISE
-    before = old.by_point(point, moves)
+    theta, whitened = estimate.theta, estimate.whitened
+    total = (1.0 + RISE) * (float(free @ old.squares) + old.prior_squares) + RISE
+
+    def by_point(squares: Array) -> Array:
+        return np.asarray(np.bincount(rays.point, moves * squares, len(ground)), dtype=np.float64)
+
+    before = by_point(old.squares)
     for halvings in range(HALVINGS + 1):
         new = _State.at(images, rays, theta, whitened, ground)
-        after, left = new.by_point(point, moves), float(new.by_point(point, free).sum())
-        away, falls = ~(after <= RUNAWAY * (before + SLACK)), left + new.prior_squares <= total
+        after, left = by_point(new.squares), float(free @ new.squares)
+        away, falls = after > RUNAWAY * (before + SLACK), left + new.prior_squares <= total
         if away.any() or not falls:  # because of what the step has promised, or because the promise does not hold?
-            promised = replace(old, squares=np.square(residuals_of(old.linear, theta, ground - old.ground)).sum(axis=1))
-            away = ~(after <= RUNAWAY * (promised.by_point(point, moves) + SLACK))
-            falls = falls or left <= PROMISED * float(promised.by_point(point, free).sum()) + RISE
+            promised = np.fmin(np.square(residuals_of(old.linear, theta, ground - old.ground)).sum(axis=1), UNSEEN)
+            away = after > RUNAWAY * (by_point(promised) + SLACK)
+            falls = falls or left <= PROMISED * float(free @ promised) + RISE
         if falls and not away.any():
             return new, halvings > 0
         if away.any() and 2 * np.count_nonzero(away) < len(away):
@@ -249,4 +251,4 @@ def _shortened(
         else:
             theta, ground = 0.5 * (old.theta + theta), 0.5 * (old.ground + ground)
             whitened = whitened if old.whitened is None else 0.5 * (old.whitened + whitened)
-    return (new if np.isfinite(after).all() else old), True
+    return (new if not ((moves > 0.0) & (new.squares >= UNSEEN)).any() else old), True

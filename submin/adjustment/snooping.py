@@ -84,7 +84,7 @@ def explain(variance: Array, residual: Array, n: int, critical: float, doubt: fl
         tries = _choices(n, size)
         greedy = tries > MOST_EXPLANATIONS
         if greedy:
-            size, tries = 1, n  # noqa: PLW2901
+            size, tries = 1, n
         best, fits = -1.0, False
         for again in range(2):
             for k in range(size):

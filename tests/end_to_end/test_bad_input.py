@@ -658,7 +658,7 @@ def _(w: World) -> list[Any]:
     return w.run(rejected=w.block(0))
 
 
-@case("block whose adjustment does not converge")
+@case("points of a block measured all at one place")
 def _(w: World) -> list[Any]:
     block = w.block(0)
     rays = w.columns("measurements")
@@ -666,6 +666,31 @@ def _(w: World) -> list[Any]:
         rays[name] = [5000.0 if b == block else v for v, b in zip(rays[name], rays["block_id"], strict=True)]
     w.put("measurements", rays)
     return w.run(rejected=block)
+
+
+def measured_elsewhere(w: World, block: str, lines: float, rows: slice = slice(None)) -> list[Any]:
+    """The rays of a block, or some of them, are measured so many lines off."""
+    rays = w.columns("measurements")
+    for k in np.flatnonzero([b == block for b in rays["block_id"]])[rows]:
+        rays["line"][k] += lines
+    w.put("measurements", rays)
+    return w.run(rejected=block)
+
+
+simply("block measured far outside its images", lambda w: measured_elsewhere(w, w.block(0), 3e5))
+simply("line far out of range", lambda w: measured_elsewhere(w, w.block(0), 1e9, slice(5, 6)))
+
+
+@case("camera on the other side of the Earth")
+def _(w: World) -> list[Any]:
+    w.camera(lambda c: c.update(LONG_OFF=c["LONG_OFF"] - 180.0))
+    return w.run(rejected=w.block(0))
+
+
+@case("line upside down in a camera")
+def _(w: World) -> list[Any]:
+    w.camera(lambda c: c.update(LINE_NUM_COEFF=[-value for value in c["LINE_NUM_COEFF"]]))
+    return w.run(rejected=w.block(0))
 
 
 @case("sample and line exchanged in a block")
@@ -758,6 +783,11 @@ simply("two things named to be withdrawn", lambda w: ["withdraw", w.fused, "--bl
 simply("withdrawal of a block that is not there", lambda w: ["withdraw", w.network, "--block", w.block()])
 simply("withdrawal of a control point that is not there", lambda w: ["withdraw", w.fused, "--control", "P"])
 simply("added control without covariance", lambda w: surveyed(w, HEADER, "P,100,35,0"))
+simply(
+    "added control with a negative variance",
+    lambda w: surveyed(w, f"{HEADER},cov_ee,cov_en,cov_eu,cov_nn,cov_nu,cov_uu", "P,100,35,0,-1,0,0,1,0,1"),
+)
+simply("added control with a negative sigma", lambda w: surveyed(w, f"{HEADER},sigma_e,sigma_n,sigma_u", "P,100,35,0,-1,1,1"))
 simply("added control with a sigma of zero", lambda w: surveyed(w, f"{HEADER},sigma_e,sigma_n,sigma_u", "P,100,35,0,1,0,1"))
 simply("tag that is taken", lambda w: ["tag", w.tagged(), "mine"])
 simply("tag like a version", lambda w: ["tag", w.fused, "v1"])

@@ -112,15 +112,17 @@ def test_a_camera_that_does_not_see_the_ground_is_named(flight: Simulated) -> No
     up = local_axes(CENTRE[None])[0, 2]
     start = flight.ground.copy()
     start[7] += 400.0 * up
-    with pytest.raises(UnseenGroundError, match=r"image a: its camera does not see the ground at point number 7; check the camera model") as raised:
+    with pytest.raises(
+        UnseenGroundError, match=r"image a: its camera does not see the ground at point number 7; check the camera model"
+    ) as raised:
         adjust(flight.images, flight.rays, start)
     message = raised.value.status.message(flight.images.ids, [f"P{j}" for j in range(30)])
     assert message == "image a: its camera does not see the ground at point P7; check the camera model and the axis order"
 
 
 def finite(result: Adjustment) -> bool:
-    used = result.accepted
-    return bool(all(np.isfinite(x).all() for x in (result.theta, result.ground, result.statistic, result.image_statistic, result.residuals[used])))
+    numbers = (result.theta, result.ground, result.statistic, result.image_statistic, result.residuals[result.accepted])
+    return all(bool(np.isfinite(x).all()) for x in numbers)
 
 
 def named(block: Simulated, result: Adjustment) -> str:

@@ -89,7 +89,7 @@ def test_the_variance_factor_is_that_of_the_measurements() -> None:
 
 @pytest.mark.parametrize("critical", [3.2905, blunders.CRITICAL_RAY])
 def test_a_minimal_detectable_blunder_is_found_in_four_of_five_cases(critical: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each trial is a new network with one blunder as large as is said to be detectable, its test is whether its own w exceeds the value."""
+    """Each trial is a new network with one blunder as large as is said to be detectable, whose own w is to exceed the value."""
     monkeypatch.setattr(blunders, "CRITICAL_RAY", np.inf)  # tested, not rejected
     monkeypatch.setattr(blunders, "IMAGE_FAMILY", 1e-9)
     hits, trials = 0, 150
