@@ -83,11 +83,11 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
     ----------
     weight : (r,) 1 for rays to be tested, 0 for rays rejected before
     theta, covariance : (m, p), (m p, m p), corrections of the images and their a posteriori covariance, both triangles
+    noise : variance of the measurements in units of the stated one, see `noise_bound`; 0 when the likeliest explanation is to be taken
 
     Notes
     -----
-    Each point is judged by itself. While a coordinate of any of its rays exceeds the critical value, the ray goes without which the
-    weighted squares drop most, and the rest are tested again. Of two rays that contradict each other both go.
+    Each point is judged by itself, see `submin.adjustment.snooping`. Of two rays that contradict each other both go.
     """
     judged, statistic = weight.copy(), np.zeros(len(weight))
     snoop(

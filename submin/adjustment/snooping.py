@@ -25,6 +25,8 @@ Offsets = NDArray[np.int64]
 
 MOST_EXPLANATIONS = 250
 """Where there are more sets of rays to try, the ray whose loss drops the squares most goes, and the rest are tested again."""
+TIE = 1e-9
+"""Drops that differ by this part are the same but for round-off."""
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -95,7 +97,7 @@ def explain(variance: Array, residual: Array, n: int, critical: float, doubt: fl
                     drops[which], worst = _leave_out(work, left, rays, size, n, testable)
                     if (greedy or worst <= critical) and drops[which] > best:
                         best, fits = drops[which], True
-                elif drops[which] >= best - (0.0 if greedy else doubt):
+                elif drops[which] >= (1.0 - TIE) * best - (0.0 if greedy else doubt):
                     for k in range(size):
                         blunder[rays[k]] = True
                 k = size - 1  # the next set, in the order of the dictionary

@@ -1009,6 +1009,50 @@ def rejected_alone(world: World, words: list[Any], row: Row, call: Call) -> None
     assert len(versions(network)) == known  # the same again writes nothing
 
 
+def not_finite(group: zarr.Group, path: str = "") -> list[str]:
+    """Arrays of a store that hold something that is no number."""
+    found = []
+    for name, member in group.members():
+        if isinstance(member, zarr.Group):
+            found += not_finite(member, f"{path}/{name}")
+        elif isinstance(member, zarr.Array) and member.dtype.kind == "f" and not np.isfinite(np.asarray(member[...])).all():
+            found.append(f"{path}/{name}")
+    return found
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-7, 1e-3])
+@pytest.mark.parametrize("alone", [True, False])
+def test_two_images_of_one_viewpoint_leave_no_nonsense(apart: float, alone: bool, world: World) -> None:
+    """They are no error: their points wait for an image from another direction, or are as uncertain as they are."""
+    block = world.block(0)
+    columns = world.columns("images")
+    first, second, *others = [i for i, b in zip(columns["image_id"], columns["block_id"], strict=True) if b == block]
+    camera = json.loads(columns["camera"][columns["image_id"].index(first)])
+    camera["LINE_NUM_COEFF"][3] += apart
+    columns["camera"][columns["image_id"].index(second)] = json.dumps(camera)
+    world.put("images", columns)
+    rays = world.columns("measurements")
+    seen = {p: (s, t) for p, i, s, t in zip(rays["point_id"], rays["image_id"], rays["sample"], rays["line"], strict=True) if i == first}
+    for k, (point, image) in enumerate(zip(rays["point_id"], rays["image_id"], strict=True)):
+        if image == second and point in seen:
+            rays["sample"][k], rays["line"][k] = seen[point]
+    world.put("measurements", rays)
+    world.rows("measurements", lambda row: row["image_id"] not in others and (row["image_id"] != second or row["point_id"] in seen))
+    world.rows("images", lambda row: row["image_id"] not in others)
+    if alone:
+        for stem in ("images", "measurements"):
+            world.rows(stem, lambda row: row["block_id"] == block)
+    result = run(Catalogue.open(world.catalogue), str(world.network), SerialExecutor())
+    assert result.rejected == () and result.unsettled_tiles == ()
+    repository = icechunk.Repository.open(icechunk.local_filesystem_storage(str(world.network)))
+    assert not_finite(zarr.open_group(repository.readonly_session("main").store, mode="r")) == []
+    control = submin.open(world.network).query(bbox=(99.0, 34.0, 101.0, 36.0), policy="rigorous")
+    assert np.isfinite(control.geocentric).all() and np.isfinite(control.covariance).all()
+    if alone:
+        assert len(control) == 0 or apart > 0.0
+        assert control.le90.min(initial=np.inf) > 10.0
+
+
 def test_a_billion_tiles_are_refused_at_once(world: World, call: Call) -> None:
     words = CASES["a billion tiles"](world)
     call(*words)

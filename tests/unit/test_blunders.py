@@ -219,10 +219,9 @@ def test_less_noise_leaves_less_doubt() -> None:
     quiet = replace(simulation.linear, y=np.zeros_like(simulation.linear.y))
     moved = replace(simulation, linear=quiet).moved({3 * j: (40.0 * np.cos(a), 40.0 * np.sin(a)) for j, a in enumerate(angle)})
     covariance = estimate(simulation).covariance
-    located = [
-        (reject_blunders(moved.linear, np.ones(1800), np.zeros((6, P)), covariance, noise)[0].reshape(600, 3) == [0, 1, 1]).all(axis=1).mean()
-        for noise in (1.0, 0.1, 0.01)
-    ]  # fmt: skip
+    every, truth = np.ones(1800), np.zeros((6, P))
+    weights = [reject_blunders(moved.linear, every, truth, covariance, noise)[0].reshape(600, 3) for noise in (1.0, 0.1, 0.01)]
+    located = [(weight == [0.0, 1.0, 1.0]).all(axis=1).mean() for weight in weights]
     assert located[0] < 0.9 < located[1] < located[2]
 
 
