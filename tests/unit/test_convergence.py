@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -12,11 +13,12 @@ from unit.test_adjustment import CENTRE, FIVE, Array, P, Simulated, adjusted, im
 
 from submin.adjustment import adjustment, blunders
 from submin.adjustment.adjustment import Adjustment, adjust
+from submin.adjustment.elimination import linearise
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
 from submin.adjustment.rays import Rays, sorted_rays
-from submin.adjustment.status import Cause, UnseenGroundError
+from submin.adjustment.status import Cause, UnseenGroundError, diagnose
 from submin.errors import NumericalError
 from submin.geodesy import Ellipsoid, geodetic_to_geocentric, local_axes
 from submin.sensors import SENSORS, Ground, Parameter, Projection
@@ -165,6 +167,36 @@ def test_a_camera_gone_mad_is_named() -> None:
     assert finite(result)
     if not result.converged:
         assert any(word in named(block, result) for word in ("check", "remove", "add"))
+
+
+@pytest.mark.parametrize(
+    ("cause", "apart", "theta", "metres", "rejected", "message"),
+    [
+        (Cause.FEW_AGREE, 0.5, 0.0, 0.0, 0.6, "only 4.% of the rays agree with each other; check the order of sample and line"),
+        (Cause.DECISIONS, 0.5, 0.0, 0.0, 0.0, "a ray of point P1 in image image 0 is rejected and taken back in turn; remove it, or give"),
+        (
+            Cause.SINGULAR,
+            1e-5,
+            0.0,
+            9.0,
+            0.0,
+            r"point P.* is seen from one direction only .its rays meet at 0.000.* degrees.; add",
+        ),
+        (Cause.CAMERA, 0.5, 4.0, 0.0, 0.0, "the correction of image image 1 still moves its rays by .* sigmas; check its camera"),
+        (Cause.POINT, 0.5, 0.0, 9.0, 0.0, "point P3 still moves by 9 m; check its measurements, or remove it"),
+    ],
+)
+def test_what_did_not_converge_is_named(cause: Cause, apart: float, theta: float, metres: float, rejected: float, message: str) -> None:
+    block = simulate(6, images=image_set(((0.2, 0.1), (0.2 + apart, 0.1))), theta=np.zeros((2, P)))
+    linear = linearise(block.images, block.rays, block.theta, block.ground, block.ground)
+    weight = (np.random.default_rng(1).uniform(size=len(block.rays)) >= rejected).astype(np.float64)
+    step, shift = np.zeros((2, P)), np.zeros((60, 3))
+    step[1, 0], shift[3, 0] = theta, metres
+    decided = np.arange(len(block.rays)) == 2
+    status = diagnose(linear, weight, (step, shift), decided, 40, 1e-6)
+    assert status.cause is cause and not status.converged and status.iterations == 40
+    said = status.message(block.images.ids, [f"P{j}" for j in range(60)])
+    assert re.match(f"the adjustment did not converge in 40 iterations: {message}", said), said
 
 
 def test_most_images_keep_their_priors() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori
 from submin.adjustment.quality import quality
 from submin.errors import InputError
+from submin.formats.height_grid import read_height_grid
 from submin.geodesy import geocentric_to_geodetic, geodetic_to_geocentric, local_axes, rotate_covariance
 
 PAIR = ((0.2, 0.1), (0.2 + 1e-5, 0.1))
@@ -140,3 +142,26 @@ def test_a_grid_is_bilinear() -> None:
 def test_heights_that_are_none(make: Callable[[], object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make()
+
+
+def test_a_grid_on_disk(tmp_path: Path) -> None:
+    axes = {"longitudes": np.array([10.0, 11.0]), "latitudes": np.array([0.0, 1.0])}
+    np.savez(tmp_path / "grid.npz", **axes, heights=np.array([[0.0, 10.0], [20.0, 30.0]]))
+    prior = read_height_grid(tmp_path / "grid.npz", 2.0)
+    assert prior.surface(np.array([10.5]), np.array([0.5])).tolist() == [15.0] and prior.sigma == 2.0
+    np.savez(tmp_path / "short.npz", **axes)
+    np.savez(tmp_path / "odd.npz", **axes, heights=np.zeros((2, 3)))
+    np.savez(tmp_path / "text.npz", **axes, heights=np.array([["a", "b"], ["c", "d"]]))
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    (tmp_path / "mine.npz").write_text("mine")
+    (tmp_path / "empty.npz").write_text("")
+    for name, message in (
+        ("nowhere.npz", "cannot be read as a grid"), ("mine.npz", "cannot be read as a grid"), ("empty.npz", "cannot be read as a grid"),
+        ("one.npy", "a single array"), ("text.npz", "cannot be read as a grid"),
+        ("short.npz", "array 'heights' is missing"), ("odd.npz", "the grid is 2 x 3"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message) as raised:
+            read_height_grid(tmp_path / name, 2.0)
+        assert str(raised.value).startswith(f"{tmp_path / name}: ")
+    with pytest.raises(InputError, match="sigma is -1"):
+        read_height_grid(tmp_path / "grid.npz", -1.0)
