@@ -18,7 +18,7 @@ from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
-from submin.adjustment.status import UnseenGroundError
+from submin.adjustment.status import Cause
 from submin.errors import SubminError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
@@ -131,12 +131,10 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
         if np.bincount(rays.point).max() < 2:
             return BlockAdjustment(block.block_id, accepted, None)
         result = adjust(images, rays, start.geocentric)
-        if not result.converged:
+        if result.status.cause is not Cause.CONVERGED:
             return BlockAdjustment(block.block_id, accepted, result.status.message(images.ids, ids))
         accepted[order] = result.accepted
         return BlockAdjustment(block.block_id, accepted, None)
-    except UnseenGroundError as error:
-        return BlockAdjustment(block.block_id, accepted, error.status.message(images.ids, ids))
     except SubminError as error:
         return BlockAdjustment(block.block_id, accepted, str(error))
 

@@ -23,9 +23,11 @@ from submin.adjustment.elimination import (
     residuals_of,
 )
 from submin.adjustment.estimation import ImageEstimate, estimate_images
+from submin.adjustment.explained import explained_metres
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays
-from submin.adjustment.status import Cause, Status, UnseenGroundError, diagnose
+from submin.adjustment.status import Cause, Status, diagnose, unseen_image
+from submin.errors import NumericalError
 
 Array = NDArray[np.float64]
 
@@ -36,8 +38,9 @@ MAX_ITERATIONS = 40
 FREE_DECISIONS = 12
 """Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
 REACH_METRES = 5000.0
-"""A point is linearised no farther than this from where it was registered. The estimate of a weak point (rays of one viewpoint) may lie
-anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours to choose."""
+"""A point is linearised no farther than this, or than its cameras explain, from where it was registered. The estimate of a weak point (rays
+of one viewpoint) may lie anywhere along its rays, out of the range in which a camera model means anything; where it is linearised is ours
+to choose."""
 CONVERGED_SIGMAS = 2e-6
 """A step that moves no ray by more than this, in sigmas of its measurement, is none."""
 CONVERGED_METRES = 1e-5
@@ -117,6 +120,11 @@ class _State:
         return cls(theta, whitened, ground, linear, np.fmin(np.einsum("rc,rc->r", residual, residual), UNSEEN))
 
     @property
+    def seen(self) -> NDArray[np.bool_]:
+        """True (r,) for rays whose camera sees the point where both are."""
+        return self.squares < UNSEEN
+
+    @property
     def prior_squares(self) -> float:
         return np.inf if self.whitened is None else float(self.whitened @ self.whitened)
 
@@ -134,28 +142,28 @@ class _Step:
 def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None = None) -> Adjustment:
     """Adjust m images and n ground points by their rays, from ground positions ``start`` (n, 3) and unadjusted cameras.
 
-    ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within `REACH_METRES` of it.
+    ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within reach of it.
 
     Raises
     ------
-    UnseenGroundError
-        When a camera does not see a point at the start.
     NumericalError
-        When the rays' information is not finite or not positive definite.
+        When a position is not finite, or the rays' information is not finite or not positive definite.
     """
+    if not np.isfinite(start).all():
+        raise NumericalError(f"the positions of {int((~np.isfinite(start)).any(axis=1).sum())} of {len(start)} points are not finite")
     anchor = start if registered is None else registered
+    reach = _reach(images, rays, anchor)
+    # round-off of normal equations goes with the square of how much worse cameras are known than rays are measured
+    round_off = (reach.max(initial=REACH_METRES) / REACH_METRES) ** 2
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
     state = _State.at(images, rays, np.zeros((len(images), images.parameters)), np.zeros(images.prior.shape[1]), start)
-    blind = np.flatnonzero(rays.accepted & (state.squares >= UNSEEN))
-    if len(blind):
-        raise UnseenGroundError(images.ids, int(rays.image[blind[0]]), int(rays.point[blind[0]]))
     iteration, robust = 0, 0
     while robust < ROBUST_ITERATIONS and iteration < MAX_ITERATIONS:
         iteration += 1
-        step = _advance(images, rays, state, anchor, weight)
+        step = _advance(images, rays, state, anchor, reach, weight)
         state, robust = step.state, 0 if step.shortened else robust + 1
-        before, weight = weight, robust_weights(state.linear, candidates, state.theta)
+        before, weight = weight, robust_weights(state.linear, np.where(state.seen, candidates, 0.0), state.theta)
         if not step.shortened and np.abs(weight - before).max(initial=0.0) < SETTLED_WEIGHT:
             break
 
@@ -165,17 +173,15 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     converged, judgements, last, before = False, 0, state, weight
     while not converged and judgements < MAX_ITERATIONS:
         judgements += 1
-        step = _advance(images, rays, state, anchor, weight)
+        step = _advance(images, rays, state, anchor, reach, weight)
         last, before, state = state, weight, step.state
         if step.shortened:  # far from the solution nothing can be judged
             continue
         theta, covariance = state.theta, step.estimate.covariance
-        moved = np.abs(moved_rays(state.linear, theta - last.theta)).max(initial=0.0)
+        moved = np.abs(moved_rays(state.linear, theta - last.theta)[state.seen]).max(initial=0.0)
         # while images move, what contradicts a point may be their doing: then only the likeliest blunder goes, with no doubt about it
-        judged, statistic = reject_blunders(
-            state.linear, candidates if judgements <= FREE_DECISIONS else weight, theta, covariance,
-            step.noise if moved < NEAR_SIGMAS else 0.0,
-        )  # fmt: skip
+        judgeable = np.where(state.seen, candidates if judgements <= FREE_DECISIONS else weight, 0.0)
+        judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, step.noise if moved < NEAR_SIGMAS else 0.0)
         worst = image_statistics(theta, covariance, images.prior_variance)
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
@@ -183,40 +189,48 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         bad = bad_cameras(worst, state.linear) & ~released & (decided or restless)
         bad &= 2 * np.count_nonzero(released | bad) <= len(images)  # without most of their priors images could say anything
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
-        converged = decided and not bad.any() and moved < CONVERGED_SIGMAS and _points_stand(last, state, weight)
+        converged = decided and not bad.any() and moved < round_off * CONVERGED_SIGMAS and _points_stand(last, state, weight, round_off)
         weight, released = judged, released | bad
         if bad.any():
             images, state = images.release(bad), replace(state, whitened=None)
 
     iteration += judgements
-    status = Status(Cause.CONVERGED, iteration) if converged else diagnose(
-        state.linear, weight, (state.theta - last.theta, state.ground - last.ground), weight != before, iteration, CONVERGED_SIGMAS
-    )  # fmt: skip
+    blind = unseen_image(state.linear, rays.accepted, state.seen)
+    if blind is not None:
+        status = Status(Cause.UNSEEN, converged, iteration, *blind)
+    elif converged:
+        status = Status(Cause.CONVERGED, True, iteration)
+    else:
+        shift = state.theta - last.theta, state.ground - last.ground
+        status = diagnose(state.linear, weight, shift, weight != before, iteration, round_off * CONVERGED_SIGMAS)
     final = residuals(state.linear, weight, state.theta)
     return Adjustment(state.theta, state.ground, weight > 0.0, statistic, released, image_statistic, final, status)
 
 
-def _points_stand(last: _State, state: _State, weight: Array) -> bool:
-    """True when a step has moved no point in any way that its rays would show."""
+def _points_stand(last: _State, state: _State, weight: Array, round_off: float) -> bool:
+    """True when a step has moved no point in any way that its rays would show; bounds grow with ``round_off``."""
     shift = state.ground - last.ground
     return bool(
-        np.abs(shift).max(initial=0.0) < CONVERGED_METRES
-        or np.abs(moved_by_ground(state.linear, shift)[weight > 0.0]).max(initial=0.0) < CONVERGED_SIGMAS
+        np.abs(shift).max(initial=0.0) < round_off * CONVERGED_METRES
+        or np.abs(moved_by_ground(state.linear, shift)[weight > 0.0]).max(initial=0.0) < round_off * CONVERGED_SIGMAS
     )
 
 
-def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, weight: Array) -> _Step:
-    """One Gauss-Newton step, points within reach of their anchors; shortened when it would make matters worse."""
-    linear = state.linear
+def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, reach: Array, weight: Array) -> _Step:
+    """One Gauss-Newton step, points within reach (n,) of their anchors; shortened when it would make matters worse.
+
+    A ray of a point that its camera does not see where both now are is left out of this step.
+    """
+    linear, weight = state.linear, np.where(state.seen, weight, 0.0)
     sums = eliminate(linear, weight, len(images))
     estimate = estimate_images(sums, images.prior, images.parameters)
     factors = point_factors(linear, weight)
     offset = state.ground + ground_corrections(factors, linear, estimate.theta) - anchor
     distance = np.linalg.norm(offset, axis=1)
-    offset *= np.minimum(1.0, REACH_METRES / np.maximum(distance, REACH_METRES))[:, None]
+    offset *= (reach / np.maximum(distance, reach))[:, None]
     # a point that stays, or is held back, is not where its rays want it: it does not tell whether the step was good
     moves = weight * (factors.rank == 3)[rays.point]
-    free = moves * (distance <= REACH_METRES)[rays.point]
+    free = moves * (distance <= reach)[rays.point]
     reached, shortened = _shortened(images, rays, state, moves, free, estimate, anchor + offset)
     return _Step(reached, estimate, noise_bound(estimate.chi_square, sums.redundancy), shortened)
 
@@ -252,3 +266,11 @@ def _shortened(
             theta, ground = 0.5 * (old.theta + theta), 0.5 * (old.ground + ground)
             whitened = whitened if old.whitened is None else 0.5 * (old.whitened + whitened)
     return (new if not ((moves > 0.0) & (new.squares >= UNSEEN)).any() else old), True
+
+
+def _reach(images: ImageSet, rays: Rays, anchor: Array) -> Array:
+    """Metres (n,) from its anchor within which each point is linearised: `REACH_METRES`, or what its cameras explain."""
+    projection = images.project(np.zeros((len(images), images.parameters)), images.ground(anchor), rays.image, rays.point)
+    reach = np.full(len(anchor), REACH_METRES)
+    np.maximum.at(reach, rays.point, explained_metres(projection, images.prior_variance[rays.image], rays.sigma))
+    return reach

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from submin.adjustment.elimination import LinearRays, moved_by_ground, moved_rays
 from submin.adjustment.weak_geometry import UNDETERMINED_DEGREES, convergence_angles
-from submin.errors import NumericalError
 
 Array = NDArray[np.float64]
 
@@ -37,7 +36,8 @@ class Status:
 
     Attributes
     ----------
-    cause : why it ended
+    cause : why it ended, and what is wrong with it
+    converged : the last step was none and all decisions stood; so may an adjustment end whose cause is ``UNSEEN``, without these rays
     iterations : how many steps there were
     image, point : row of the worst image and point, -1 where the cause names none
     amount : rays that agree (``FEW_AGREE``), convergence angle in degrees (``SINGULAR``), or the last step (``CAMERA``: the farthest that
@@ -45,15 +45,11 @@ class Status:
     """
 
     cause: Cause
+    converged: bool
     iterations: int
     image: int = -1
     point: int = -1
     amount: float = 0.0
-
-    @property
-    def converged(self) -> bool:
-        """True when the last step was none and all decisions stood."""
-        return self.cause is Cause.CONVERGED
 
     def message(self, image_ids: Sequence[str], point_ids: Sequence[str] | NDArray[np.str_]) -> str:
         """The cause as a sentence that names image and point, and what to do."""
@@ -89,12 +85,16 @@ class Status:
                 return f"{steps}: point {point} still moves by {self.amount:.2g} m; check its measurements, or remove it"
 
 
-class UnseenGroundError(NumericalError):
-    """A camera does not see a point where it is to begin with; ``status`` tells which."""
-
-    def __init__(self, image_ids: Sequence[str], image: int, point: int) -> None:
-        self.status = Status(Cause.UNSEEN, 0, image, point)
-        super().__init__(f"image {image_ids[image]}: its camera does not see the ground at point number {point}; check the camera model")
+def unseen_image(linear: LinearRays, candidates: NDArray[np.bool_], seen: NDArray[np.bool_]) -> tuple[int, int] | None:
+    """An image that sees nothing of what its candidate rays (r,) were measured of, and the point of the first; None if there is none."""
+    if seen.all():
+        return None
+    measured = np.bincount(linear.image[candidates])
+    blind = np.flatnonzero((measured > 0) & (np.bincount(linear.image[candidates & seen], minlength=len(measured)) == 0))
+    if not len(blind):
+        return None
+    ray = int(np.flatnonzero(candidates & (linear.image == blind[0]))[0])
+    return int(blind[0]), int(np.searchsorted(linear.first, ray, side="right")) - 1
 
 
 def diagnose(
@@ -112,19 +112,19 @@ def diagnose(
     used = weight > 0.0
     agreeing = float(used.mean()) if len(used) else 0.0
     if agreeing < FORMLESS:
-        return Status(Cause.FEW_AGREE, iterations, amount=agreeing)
+        return Status(Cause.FEW_AGREE, False, iterations, amount=agreeing)
     point = np.repeat(np.arange(len(linear.first) - 1), np.diff(linear.first))
     by_image = np.where(used, np.abs(moved_rays(linear, step[0])).max(axis=1), 0.0)
     by_ground = np.where(used, np.abs(moved_by_ground(linear, step[1])).max(axis=1), 0.0)
     worst = int(np.argmax(np.maximum(by_image, by_ground)))
     if max(by_image[worst], by_ground[worst]) < still and decided.any():
         worst = int(np.argmax(decided))
-        return Status(Cause.DECISIONS, iterations, int(linear.image[worst]), int(point[worst]))
+        return Status(Cause.DECISIONS, False, iterations, int(linear.image[worst]), int(point[worst]))
     angles = convergence_angles(linear, weight)
     met = np.isfinite(angles)
     if met.any() and np.median(angles[met]) < UNDETERMINED_DEGREES:
         narrow = int(np.nanargmin(angles))
-        return Status(Cause.SINGULAR, iterations, point=narrow, amount=float(angles[narrow]))
+        return Status(Cause.SINGULAR, False, iterations, point=narrow, amount=float(angles[narrow]))
     if by_image[worst] >= by_ground[worst]:
-        return Status(Cause.CAMERA, iterations, int(linear.image[worst]), amount=float(by_image[worst]))
-    return Status(Cause.POINT, iterations, point=int(point[worst]), amount=float(np.linalg.norm(step[1][point[worst]])))
+        return Status(Cause.CAMERA, False, iterations, int(linear.image[worst]), amount=float(by_image[worst]))
+    return Status(Cause.POINT, False, iterations, point=int(point[worst]), amount=float(np.linalg.norm(step[1][point[worst]])))
