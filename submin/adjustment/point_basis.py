@@ -98,6 +98,37 @@ def most_rays(first: Offsets) -> int:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def complement(q: Array, rank: int, k: int, basis: Array) -> int:
+    """Orthonormal basis (k, k - rank) of all that q (k, rank) does not span, Gram-Schmidt done twice. Returns the number of its columns."""
+    for m in range(k - rank):
+        axis, most = 0, -1.0  # the axis that has most left to say
+        for i in range(k):
+            left = 1.0
+            for e in range(rank):
+                left -= q[i, e] * q[i, e]
+            for e in range(m):
+                left -= basis[i, e] * basis[i, e]
+            if left > most:
+                axis, most = i, left
+        for i in range(k):
+            basis[i, m] = 1.0 if i == axis else 0.0
+        for _ in range(2):
+            for e in range(rank + m):
+                dot = 0.0
+                for i in range(k):
+                    dot += (q[i, e] if e < rank else basis[i, e - rank]) * basis[i, m]
+                for i in range(k):
+                    basis[i, m] -= dot * (q[i, e] if e < rank else basis[i, e - rank])
+        norm = 0.0
+        for i in range(k):
+            norm += basis[i, m] * basis[i, m]
+        norm = np.sqrt(norm)
+        for i in range(k):
+            basis[i, m] /= norm
+    return k - rank
+
+
+@numba.njit(cache=True, error_model="numpy")
 def remove_ground(q: Array, rank: int, k: int, t: Array) -> None:
     """Project the first k numbers of t onto what the point cannot explain, ``(I - QQ')t``, in place."""
     for e in range(rank):

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.point_basis import gather, most_rays, orthonormal, remove_ground
+from submin.adjustment.point_basis import complement, gather, most_rays, orthonormal, remove_ground
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -114,40 +114,53 @@ def explain(variance: Array, residual: Array, n: int, critical: float, doubt: fl
 
 
 @numba.njit(cache=True, error_model="numpy")
-def residual_rows(
+def residual_space(
     n: int, rays: Offsets, root: Array, image: Index, by_parameters: Array, q: Array, rank: int, covariance: Array,
-    z: Array, row: Array, product: Array, free: Array,
-) -> None:  # fmt: skip
-    """What the n rays of a point say of the images once the point is gone, ``row = P A`` (2 n, n p), and the variances of its residuals.
+    basis: Array, z: Array, product: Array, nearby: Array, inner: Array,
+) -> int:  # fmt: skip
+    """Covariance of the residuals of a point's n rays, ``V = N inner N'`` with N the directions (2 n, m) that the point leaves free.
 
-    ``product = row M`` with M the images' covariance, ``free = diag(P - row M row')`` (2 n): the redundancy numbers of the coordinates.
+    ``basis`` becomes N, ``inner = I - N'A M A'N`` (m, m) with M the images' covariance: fewer numbers than 2 n rows of A. Returns m.
     """
     p = by_parameters.shape[2]
+    free, size = complement(q, rank, 2 * n, basis), n * p
     for a in range(n):
-        for u in range(p):
-            for e in range(rank):
-                z[a, e, u] = root[a] * (q[2 * a, e] * by_parameters[rays[a], 0, u] + q[2 * a + 1, e] * by_parameters[rays[a], 1, u])
-    for k in range(2 * n):
-        a, c = k // 2, k % 2
-        free[k] = 1.0
-        for e in range(rank):
-            free[k] -= q[k, e] ** 2
         for s in range(n):
+            at, to = image[rays[a]] * p, image[rays[s]] * p
             for u in range(p):
-                value = root[a] * by_parameters[rays[s], c, u] if s == a else 0.0
-                for e in range(rank):
-                    value -= q[k, e] * z[s, e, u]
-                row[k, s * p + u] = value
-        for s in range(n):
-            at = image[rays[s]] * p
+                for x in range(p):
+                    nearby[a * p + u, s * p + x] = covariance[at + u, to + x]
+    for e in range(free):
+        for a in range(n):
             for u in range(p):
-                total = 0.0
-                for s2 in range(n):
-                    to = image[rays[s2]] * p
-                    for x in range(p):
-                        total += covariance[at + u, to + x] * row[k, s2 * p + x]
-                product[k, s * p + u] = total
-                free[k] -= total * row[k, s * p + u]
+                z[e, a * p + u] = root[a] * (
+                    basis[2 * a, e] * by_parameters[rays[a], 0, u] + basis[2 * a + 1, e] * by_parameters[rays[a], 1, u]
+                )  # fmt: skip
+    for e in range(free):
+        for i in range(size):
+            product[e, i] = 0.0
+        for i in range(size):
+            part = z[e, i]
+            for k in range(size):
+                product[e, k] += part * nearby[i, k]
+        for d in range(e + 1):
+            total = 1.0 if d == e else 0.0
+            for i in range(size):
+                total -= product[e, i] * z[d, i]
+            inner[e, d] = inner[d, e] = total
+    return free
+
+
+@numba.njit(cache=True, error_model="numpy")
+def residual_covariance(basis: Array, inner: Array, free: int, i: int, k: int) -> float:
+    """Element (i, k) of ``N inner N'``."""
+    total = 0.0
+    for e in range(free):
+        half = 0.0
+        for d in range(free):
+            half += inner[e, d] * basis[k, d]
+        total += basis[i, e] * half
+    return total
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -163,9 +176,9 @@ def snoop(
     most = most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
-    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
-    row, product, variance = np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((2 * most, 2 * most))
-    free, blunder = np.empty(2 * most), np.empty(most, np.bool_)
+    r, pivot, blunder = np.empty((3, 3)), np.empty(3, np.int32), np.empty(most, np.bool_)
+    basis, inner, variance = np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most))
+    z, product, nearby = np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((most * p, most * p))
     for j in range(len(first) - 1):
         while True:
             n = gather(j, first, weight, by_ground, y, rays, root, b, t)
@@ -181,20 +194,17 @@ def snoop(
                         t[2 * a + c] -= by_parameters[i, c, u] * theta[image[i], u]
             remove_ground(q, rank, 2 * n, t)
             worst = 0.0
-            residual_rows(n, rays, root, image, by_parameters, q, rank, covariance, z, row, product, free)
+            free = residual_space(n, rays, root, image, by_parameters, q, rank, covariance, basis, z, product, nearby, inner)
             for k in range(2 * n):
-                w = abs(t[k]) / np.sqrt(free[k]) if free[k] >= testable else 0.0
+                own = residual_covariance(basis, inner, free, k, k)
+                w = abs(t[k]) / np.sqrt(own) if own >= testable else 0.0
                 statistic[rays[k // 2]] = w if k % 2 == 0 else max(statistic[rays[k // 2]], w)
                 worst = max(worst, w)
             if not worst > critical:
                 break
             for k in range(2 * n):
                 for i in range(2 * n):
-                    variance[k, i] = 1.0 if k == i else 0.0
-                    for e in range(rank):
-                        variance[k, i] -= q[k, e] * q[i, e]
-                    for s in range(n * p):
-                        variance[k, i] -= row[k, s] * product[i, s]
+                    variance[k, i] = residual_covariance(basis, inner, free, k, i)
             explain(variance, t, n, critical, doubt, testable, blunder)
             for a in range(n):
                 if blunder[a]:
