@@ -44,6 +44,8 @@ to choose."""
 CONVERGED_SIGMAS = 2e-6
 """A step that moves no ray by more than this, in sigmas of its measurement, is none."""
 CONVERGED_METRES = 1e-5
+NEAR_ENOUGH_SIGMAS = 1e-2
+"""A step that moves images by less is the last one, too, where it was linear to `CONVERGED_SIGMAS`: another one would find nothing."""
 PATIENCE = 4
 RESTLESS = 0.05
 """When after so many iterations decisions still change about this part of the rays, images are judged: a bad camera may be why."""
@@ -189,7 +191,8 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         bad = bad_cameras(worst, state.linear) & ~released & (decided or restless)
         bad &= 2 * np.count_nonzero(released | bad) <= len(images)  # without most of their priors images could say anything
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
-        converged = decided and not bad.any() and moved < round_off * CONVERGED_SIGMAS and _points_stand(last, state, weight, round_off)
+        rests = moved < round_off * CONVERGED_SIGMAS and _points_stand(last, state, weight, round_off)
+        converged = decided and not bad.any() and (rests or (moved < NEAR_ENOUGH_SIGMAS and _linear(last, state, weight)))
         weight, released = judged, released | bad
         if bad.any():
             images, state = images.release(bad), replace(state, whitened=None)
@@ -205,6 +208,13 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         status = diagnose(state.linear, weight, shift, weight != before, iteration, round_off * CONVERGED_SIGMAS)
     final = residuals(state.linear, weight, state.theta)
     return Adjustment(state.theta, state.ground, weight > 0.0, statistic, released, image_statistic, final, status)
+
+
+def _linear(last: _State, state: _State, weight: Array) -> bool:
+    """True when the residuals after a step are those that it promised: the solution of the linear problem is that of the problem."""
+    promised = residuals_of(last.linear, state.theta, state.ground - last.ground)
+    found = state.linear.y - moved_rays(state.linear, state.theta)
+    return bool(np.abs(promised - found)[weight > 0.0].max(initial=0.0) < CONVERGED_SIGMAS)
 
 
 def _points_stand(last: _State, state: _State, weight: Array, round_off: float) -> bool:

@@ -92,18 +92,39 @@ def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, 
     ``origin`` (n, 3) is the fixed origin of each point's coordinates.
     """
     ground = images.ground(linearised_at)
-    projection = images.project(theta, ground, rays.image, rays.point, rays.observed)
-    y = rays.observed - projection.image
-    y += np.einsum("rcp,rp->rc", projection.by_parameters, theta[rays.image])
-    y += np.einsum("rck,rk->rc", projection.by_ground, (linearised_at - origin)[rays.point])
-    y /= rays.sigma
-    return LinearRays(
-        rays.first(len(origin)),
-        rays.image,
-        projection.by_ground / rays.sigma[:, :, None],
-        projection.by_parameters / rays.sigma[:, :, None],
-        y,
+    seen = images.project(theta, ground, rays.image, rays.point, rays.observed)
+    # the projection is nobody else's: its arrays become those of the rays
+    y = _whiten(
+        seen.image, seen.by_ground, seen.by_parameters, rays.observed, rays.sigma, rays.image, rays.point, theta, linearised_at - origin
     )
+    return LinearRays(rays.first(len(origin)), rays.image, seen.by_ground, seen.by_parameters, y)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _whiten(
+    seen: Array,
+    by_ground: Array,
+    by_parameters: Array,
+    observed: Array,
+    sigma: Array,
+    image: Index,
+    point: Index,
+    theta: Array,
+    shift: Array,
+) -> Array:
+    """Divide partials by the sigmas of their coordinates, in place, and reduce the observations to ``y`` (r, 2)."""
+    y = np.empty(seen.shape)
+    for r in range(len(seen)):
+        for c in range(2):
+            whole, part = observed[r, c] - seen[r, c], 1.0 / sigma[r, c]
+            for u in range(by_parameters.shape[2]):
+                whole += by_parameters[r, c, u] * theta[image[r], u]
+                by_parameters[r, c, u] *= part
+            for k in range(3):
+                whole += by_ground[r, c, k] * shift[point[r], k]
+                by_ground[r, c, k] *= part
+            y[r, c] = whole * part
+    return y
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -42,7 +42,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Projection:
-    """Image coordinates of rays and their partials.
+    """Image coordinates of rays and their partials; whoever asked for them may change the arrays.
 
     Attributes
     ----------
