@@ -11,7 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.blunders import bad_cameras, image_statistics, noise_bound, reject_blunders, residuals, robust_weights
+from submin.adjustment.blunders import (
+    bad_cameras,
+    deserted_image,
+    image_statistics,
+    noise_bound,
+    reject_blunders,
+    residuals,
+    robust_weights,
+)
 from submin.adjustment.elimination import (
     LinearRays,
     eliminate,
@@ -183,12 +191,17 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         moved = np.abs(moved_rays(state.linear, theta - last.theta)[state.seen]).max(initial=0.0)
         # while images move, what contradicts a point may be their doing: then only the likeliest blunder goes, with no doubt about it
         judgeable = np.where(state.seen, candidates if judgements <= FREE_DECISIONS else weight, 0.0)
-        judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, step.noise if moved < NEAR_SIGMAS else 0.0)
+        doubt = step.noise if moved < NEAR_SIGMAS else 0.0
+        judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, doubt, weight)
         worst = image_statistics(theta, covariance, images.prior_variance)
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         restless = judgements % PATIENCE == 0 and np.count_nonzero(judged != weight) > RESTLESS * len(rays)
-        bad = bad_cameras(worst, state.linear) & ~released & (decided or restless)
+        bad = (
+            (bad_cameras(worst, state.linear) | deserted_image(state.linear, judgeable, judged, released))
+            & ~released
+            & (decided or restless)
+        )
         bad &= 2 * np.count_nonzero(released | bad) <= len(images)  # without most of their priors images could say anything
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
         rests = moved < round_off * CONVERGED_SIGMAS and _points_stand(last, state, weight, round_off)
@@ -234,15 +247,25 @@ def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, reach: 
     linear, weight = state.linear, np.where(state.seen, weight, 0.0)
     sums = eliminate(linear, weight, len(images))
     estimate = estimate_images(sums, images.prior, images.parameters)
-    factors = point_factors(linear, weight)
+    placing = _placing(rays, weight, state.seen)
+    factors = point_factors(linear, placing)
     offset = state.ground + ground_corrections(factors, linear, estimate.theta) - anchor
     distance = np.linalg.norm(offset, axis=1)
     offset *= (reach / np.maximum(distance, reach))[:, None]
     # a point that stays, or is held back, is not where its rays want it: it does not tell whether the step was good
-    moves = weight * (factors.rank == 3)[rays.point]
-    free = moves * (distance <= reach)[rays.point]
+    moves = placing * (factors.rank == 3)[rays.point]
+    free = weight * (moves > 0.0) * (distance <= reach)[rays.point]
     reached, shortened = _shortened(images, rays, state, moves, free, estimate, anchor + offset)
     return _Step(reached, estimate, noise_bound(estimate.chi_square, sums.redundancy), shortened)
+
+
+def _placing(rays: Rays, weight: Array, seen: NDArray[np.bool_]) -> Array:
+    """Weights (r,) of the rays that say where points are: the accepted ones, and all of a point that has fewer than two of these.
+
+    Whether its rays are blunders can only be told where they would have the point.
+    """
+    lost = np.bincount(rays.point[weight > 0.0], minlength=int(rays.point.max(initial=-1)) + 1)[rays.point] < 2
+    return np.where(lost, (rays.accepted & seen).astype(np.float64), weight)
 
 
 def _shortened(
@@ -263,10 +286,13 @@ def _shortened(
     for halvings in range(HALVINGS + 1):
         new = _State.at(images, rays, theta, whitened, ground)
         after, left = by_point(new.squares), float(free @ new.squares)
-        away, falls = after > RUNAWAY * (before + SLACK), left + new.prior_squares <= total
+        away, falls = after > before + SLACK, left + new.prior_squares <= total
         if away.any() or not falls:  # because of what the step has promised, or because the promise does not hold?
-            promised = np.fmin(np.square(residuals_of(old.linear, theta, ground - old.ground)).sum(axis=1), UNSEEN)
-            away = after > RUNAWAY * (by_point(promised) + SLACK)
+            promised, staying = (
+                np.fmin(np.square(residuals_of(old.linear, theta, shift)).sum(axis=1), UNSEEN)
+                for shift in (ground - old.ground, 0.0 * ground)
+            )
+            away = after > np.minimum(RUNAWAY * (by_point(promised) + SLACK), by_point(staying) + SLACK)
             falls = falls or left <= PROMISED * float(free @ promised) + RISE
         if falls and not away.any():
             return new, halvings > 0

@@ -22,6 +22,8 @@ DOUBT = 9.2
 """An explanation whose weighted squares exceed the best one's by less is as good: it is one hundredth as likely, ``2 ln 100``."""
 IMAGE_FAMILY = 0.05
 """Chance that any good image of a set adjusted together is said to have a bad camera (Bonferroni over all parameters tested)."""
+DESERTED_RAYS = 8
+"""An image with fewer rays can lose most of them to blunders."""
 TESTABLE = 0.01
 """A coordinate or parameter is tested when at least this part of its a priori variance is checked by other observations."""
 ROBUST_SCALE = 2.4
@@ -76,7 +78,9 @@ def residuals(linear: LinearRays, weight: Array, theta: Array) -> Array:
     return np.asarray(_residuals(linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta)[0])
 
 
-def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance: Array, noise: float = 1.0) -> tuple[Array, Array]:
+def reject_blunders(
+    linear: LinearRays, weight: Array, theta: Array, covariance: Array, noise: float = 1.0, used: Array | None = None
+) -> tuple[Array, Array]:
     """Weights (r,) of the rays, 0 for blunders, and the test statistic (r,) of each, at an adjustment of the images.
 
     Parameters
@@ -84,6 +88,7 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
     weight : (r,) 1 for rays to be tested, 0 for rays rejected before
     theta, covariance : (m, p), (m p, m p), corrections of the images and their a posteriori covariance, both triangles
     noise : variance of the measurements in units of the stated one, see `noise_bound`; 0 when the likeliest explanation is to be taken
+    used : (r,) 1 for the rays with which the images were adjusted; by default those that are tested
 
     Notes
     -----
@@ -91,7 +96,7 @@ def reject_blunders(linear: LinearRays, weight: Array, theta: Array, covariance:
     """
     judged, statistic = weight.copy(), np.zeros(len(weight))
     snoop(
-        linear.first, linear.image, judged, linear.by_ground, linear.by_parameters, linear.y,
+        linear.first, linear.image, judged, weight if used is None else used, linear.by_ground, linear.by_parameters, linear.y,
         theta, covariance, CRITICAL_RAY, DOUBT * noise, TESTABLE, statistic,
     )  # fmt: skip
     return judged, statistic
@@ -156,3 +161,19 @@ def bad_cameras(statistics: Array, linear: LinearRays) -> NDArray[np.bool_]:
         linked = (sees & sees[k]).any(axis=1)
         bad[i] = worst[i] >= worst[suspects][linked].max()
     return bad
+
+
+def deserted_image(linear: LinearRays, tested: Array, judged: Array, released: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The image (m,), one at most, that has lost most of its rays: not they are wrong, but its camera.
+
+    Parameters
+    ----------
+    tested, judged : (r,) above 0 for rays that were tested, and for those of them that passed; released : (m,) images left out of account
+    """
+    every = np.bincount(linear.image, tested > 0.0, len(released))
+    lost = np.bincount(linear.image, (tested > 0.0) & ~(judged > 0.0), len(released))
+    part = np.where((every >= DESERTED_RAYS) & ~released, lost / np.maximum(every, 1.0), 0.0)
+    deserted = np.zeros(len(released), dtype=np.bool_)
+    if part.max(initial=0.0) > 0.5:
+        deserted[np.argmax(part)] = True
+    return deserted

@@ -17,12 +17,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.point_basis import complement, gather, most_rays, orthonormal, remove_ground
+from submin.adjustment.point_basis import complement, gather, most_rays, orthonormal
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 Offsets = NDArray[np.int64]
 
+UNCHECKED = 1e-10
+"""Part of a direction's variance below which nothing but the point's own rays says where its images are."""
 MOST_EXPLANATIONS = 250
 """Where there are more sets of rays to try, the ray whose loss drops the squares most goes, and the rest are tested again."""
 TIE = 1e-9
@@ -164,21 +166,95 @@ def residual_covariance(basis: Array, inner: Array, free: int, i: int, k: int) -
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _misclosures(n: int, rays: Offsets, root: Array, image: Index, by_parameters: Array, theta: Array, t: Array) -> None:
+    """Take what the images' corrections explain out of the stacked observations ``t`` (2 n) of a point, in place."""
+    for a in range(n):
+        i = rays[a]
+        for c in range(2):
+            for u in range(by_parameters.shape[2]):
+                t[2 * a + c] -= root[a] * by_parameters[i, c, u] * theta[image[i], u]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _cross(
+    n: int, rays: Offsets, z: Array, free: int, n2: int, rays2: Offsets, z2: Array, free2: int, image: Index, covariance: Array, p: int
+) -> Array:
+    """``z M z2'`` (free, free2) of two sets of rays."""
+    cross = np.zeros((free, free2))
+    for a in range(n):
+        for s in range(n2):
+            at, to = image[rays[a]] * p, image[rays2[s]] * p
+            for e in range(free):
+                for x in range(p):
+                    half = 0.0
+                    for u in range(p):
+                        half += z[e, a * p + u] * covariance[at + u, to + x]
+                    for d in range(free2):
+                        cross[e, d] += half * z2[d, s * p + x]
+    return cross
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _predicted(inner: Array, e: Array, cross: Array, inner2: Array, e2: Array, free: int, free2: int) -> None:
+    """Turn what a set of rays says into what it would, were the images adjusted with these rays of the point and no others of it.
+
+    ``inner`` (free, free) and ``e`` (free) are ``I - zMz'`` and the misclosures of the set, ``inner2``, ``e2`` those of the rays of the
+    point with which the images *were* adjusted. Without the point the misclosures are ``e + X inner2^-1 e2`` of covariance
+    ``C = I + zMz' + X inner2^-1 X'``, X = ``cross``; ``inner`` becomes ``C^-1`` and ``e`` becomes ``C^-1`` times them.
+    """
+    spread, mean = np.empty((free, free)), np.empty((free, 1))
+    for i in range(free):
+        mean[i, 0] = e[i]
+        for k in range(free):
+            spread[i, k] = (2.0 if i == k else 0.0) - inner[i, k]
+    if free2 > 0:
+        values, vectors = np.linalg.eigh(np.ascontiguousarray(inner2[:free2, :free2]))
+        turned = cross @ vectors
+        for d in range(free2):
+            value, part = max(values[d], UNCHECKED), 0.0
+            for k in range(free2):
+                part += vectors[k, d] * e2[k]
+            for i in range(free):
+                mean[i, 0] += turned[i, d] * part / value
+                for k in range(free):
+                    spread[i, k] += turned[i, d] * turned[k, d] / value
+    inverse = np.linalg.inv(spread)
+    solved = inverse @ mean
+    for i in range(free):
+        e[i] = solved[i, 0]
+        for k in range(free):
+            inner[i, k] = inverse[i, k]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _along(basis: Array, free: int, k: int, t: Array, e: Array) -> None:
+    """``e = N't`` (free) of stacked numbers (k)."""
+    for m in range(free):
+        e[m] = 0.0
+        for i in range(k):
+            e[m] += basis[i, m] * t[i]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def snoop(
-    first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array,
+    first: Offsets, image: Index, weight: Array, used: Array, by_ground: Array, by_parameters: Array, y: Array,
     theta: Array, covariance: Array, critical: float, doubt: float, testable: float, statistic: Array,
 ) -> None:  # fmt: skip
     """Test the rays of each point by itself, reject its blunders, and test again until nothing fails.
 
-    Changes ``weight``; ``statistic`` (r,) becomes each ray's last w.
+    Changes ``weight``; ``statistic`` (r,) becomes each ray's last w. ``used`` (r,) is above 0 for the rays with which the images were
+    adjusted: a test must not depend on them, or a ray that moves its image far would be taken back and rejected in turn.
     """
     p = by_parameters.shape[2]
     most = most_rays(first)
-    rays, root = np.empty(most, np.int64), np.empty(most)
+    rays, root, rays2, root2 = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, blunder = np.empty((3, 3)), np.empty(3, np.int32), np.empty(most, np.bool_)
     basis, inner, variance = np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most))
-    z, product, nearby = np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((most * p, most * p))
+    basis2, inner2, e, e2 = np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most)), np.empty(2 * most), np.empty(2 * most)
+    z, z2, product, nearby = (
+        np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((most * p, most * p))
+    )  # fmt: skip
     for j in range(len(first) - 1):
         while True:
             n = gather(j, first, weight, by_ground, y, rays, root, b, t)
@@ -187,14 +263,29 @@ def snoop(
             rank = orthonormal(b, 2 * n, q, r, pivot)
             if 2 * n <= rank:
                 break
-            for a in range(n):
-                i = rays[a]
-                for c in range(2):
-                    for u in range(p):
-                        t[2 * a + c] -= by_parameters[i, c, u] * theta[image[i], u]
-            remove_ground(q, rank, 2 * n, t)
-            worst = 0.0
+            same = True
+            for i in range(first[j], first[j + 1]):
+                same = same and (weight[i] > 0.0) == (used[i] > 0.0)
             free = residual_space(n, rays, root, image, by_parameters, q, rank, covariance, basis, z, product, nearby, inner)
+            _misclosures(n, rays, root, image, by_parameters, theta, t)
+            _along(basis, free, 2 * n, t, e)
+            if not same:
+                n2 = gather(j, first, used, by_ground, y, rays2, root2, b, t)
+                free2 = 0
+                if n2 > 0:
+                    rank2 = orthonormal(b, 2 * n2, q, r, pivot)
+                    free2 = residual_space(
+                        n2, rays2, root2, image, by_parameters, q, rank2, covariance, basis2, z2, product, nearby, inner2
+                    )  # fmt: skip
+                    _misclosures(n2, rays2, root2, image, by_parameters, theta, t)
+                    _along(basis2, free2, 2 * n2, t, e2)
+                cross = _cross(n, rays, z, free, n2, rays2, z2, free2, image, covariance, p)
+                _predicted(inner, e, cross, inner2, e2, free, free2)
+            for k in range(2 * n):
+                t[k] = 0.0
+                for m in range(free):
+                    t[k] += basis[k, m] * e[m]
+            worst = 0.0
             for k in range(2 * n):
                 own = residual_covariance(basis, inner, free, k, k)
                 w = abs(t[k]) / np.sqrt(own) if own >= testable else 0.0
