@@ -220,11 +220,12 @@ def correlation_factor(correlation: Array) -> Array:
 def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     """Factor ``K`` (m p, q) of the a priori covariance of m images with p parameters each, image-major.
 
-    Columns are whitened vectors: one for every image and adjustable parameter (its block's own parts), and one for every pass and
-    parameter that its images share. An image without a priori model has none: its parameters are zero, as are those that its sensor does
-    not have. Images may be any subset of a network: ``K K'`` is then the marginal of the whole prior.
+    Columns are whitened vectors: one for every image and adjustable parameter (its block's own parts), image-major, and one for every pass
+    and parameter that its images share. An image without a priori model has none: its parameters are zero, as are those that its sensor
+    does not have. Images may be any subset of a network: ``K K'`` is then the marginal of the whole prior.
     """
-    m, p = len(images), parameters
+    m, p, columns = len(images), parameters, 0
+    own_column: dict[tuple[int, int], int] = {}
     blocks: dict[tuple[str, tuple[Parameter, ...]], list[int]] = {}
     shared: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for i, image in enumerate(images):
@@ -232,11 +233,13 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
             blocks.setdefault((image.block_id, image.parameters), []).append(i)
             for c, parameter in enumerate(image.parameters):
                 stated = _stated(image.a_priori, parameter)
+                if stated.sigma > 0.0:
+                    own_column[i, c], columns = columns, columns + 1
                 if stated.common_to_pass > 0.0 and stated.sigma > 0.0:
                     common = stated.sigma * np.sqrt(stated.common_to_pass)
                     shared.setdefault((image.pass_id, parameter.name), []).append((i * p + c, common))
 
-    entries, columns = _Entries(), 0
+    entries = _Entries()
     for (_, names), members in blocks.items():
         model = images[members[0]].a_priori
         assert model is not None
@@ -252,8 +255,7 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
             if key not in factors:
                 factors[key] = _own_factor(stated, seconds, released)
             own = stated.sigma * np.where(released, RELEASE_FACTOR, np.sqrt(1.0 - stated.common_to_pass))
-            entries.add(at * p + c, columns + np.arange(len(members)), factors[key] * own[:, None])
-            columns += len(members)
+            entries.add(at * p + c, np.array([own_column[i, c] for i in members]), factors[key] * own[:, None])
     for k, members_of_pass in enumerate(shared.values()):
         rows, sigmas = zip(*members_of_pass, strict=True)
         entries.add(np.array(rows), np.array([columns + k]), np.array(sigmas)[:, None])
