@@ -30,6 +30,7 @@ from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_to
 from submin.sensors import Ground, sensor_named
 from submin.sensors.footprint import footprints
 from submin.simulation.rpc_fit import fit_rpc
+from submin.simulation.scene import SimulatedImage, utc
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -163,27 +164,6 @@ class RegionDesign:
         return _centres(self.width_km, self.scene_km, max(round(wanted), int(np.ceil(self.width_km / self.scene_km - 1e-9))))
 
 
-@dataclass(frozen=True)
-class SimulatedImage:
-    """One image as the catalogue describes it: ``camera`` is JSON text, ``acquired`` ISO 8601 text in UTC, ``footprint`` WKB in degrees."""
-
-    image_id: str
-    block_id: str
-    pass_id: str
-    platform: str
-    sensor: str
-    camera: str
-    width: int
-    height: int
-    acquired: str
-    footprint: bytes
-
-    @property
-    def seconds(self) -> float:
-        """Time of acquisition in seconds since 1970."""
-        return datetime.datetime.fromisoformat(self.acquired).timestamp()
-
-
 @dataclass(frozen=True, eq=False)
 class SimulatedRegion:
     """A region with everything that a network may know, and the truth that it must not.
@@ -247,13 +227,18 @@ class RegionFrame:
     @classmethod
     def of(cls, design: RegionDesign, ellipsoid: Ellipsoid = WGS84) -> RegionFrame:
         """The frame of a design."""
-        centre = np.array([[design.longitude, design.latitude, 0.0]])
+        return cls.at(design.longitude, design.latitude, design.azimuth, ellipsoid)
+
+    @classmethod
+    def at(cls, longitude: float, latitude: float, azimuth: float, ellipsoid: Ellipsoid = WGS84) -> RegionFrame:
+        """The frame about a centre, with the track's azimuth there; all in degrees."""
+        centre = np.array([[longitude, latitude, 0.0]])
         position = geodetic_to_geocentric(centre, ellipsoid)[0]
         radius = float(np.linalg.norm(position))
         up = position / radius
         east, north, _ = local_axes(centre)[0]
-        azimuth = np.radians(design.azimuth)
-        along = np.sin(azimuth) * east + np.cos(azimuth) * north
+        angle = np.radians(azimuth)
+        along = np.sin(angle) * east + np.cos(angle) * north
         along -= up * (up @ along)
         along /= np.linalg.norm(along)
         return cls(radius, np.stack([up, along, np.cross(up, along)]), ellipsoid)
@@ -466,7 +451,7 @@ def _acquired(strip: int, angle: float, orbit_radius: float) -> str:
     """ISO text of the time at which a strip's satellite passes an angle of its orbit, to the millisecond."""
     seconds = angle * np.sqrt(orbit_radius**3 / GRAVITY_PARAMETER)
     time = FIRST_PASS + datetime.timedelta(days=DAYS_BETWEEN_PASSES * strip, milliseconds=round(1e3 * seconds))
-    return time.replace(tzinfo=None).isoformat(timespec="milliseconds") + "Z"
+    return utc(time)
 
 
 def _tie_points(design: RegionDesign, rng: np.random.Generator) -> tuple[Ids, Array, Array, Array]:
