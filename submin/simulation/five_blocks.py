@@ -9,8 +9,8 @@ block 4 lies by itself to the north, and block 5, one long pair from south to no
              5                   Places are given in kilometres east and north of the southwestern corner of block 1.
     south
 
-The camera is a frame of 3 m focal length that stands for a scanner: its pixels are 2.5 m on the ground both ways. Which of it the paper states
-and which was chosen is in docs/experiments.md.
+The camera is a frame of 3 m focal length that stands for a scanner: its pixels are 2.5 m on the ground both ways. Which of it the paper
+states and which was chosen is in docs/experiments.md.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ PAIRS = (
     Pair(4, 62.5, 120.0), Pair(5, 19.0, 73.0),
 )  # fmt: skip
 ROWS = (69.0, 56.0, 44.0, 31.0, 19.0, 6.0)
-"""Kilometres north of the points of blocks 1, 2 and 3: two rows are in the northern pair of block 1 alone, two in both, two in the southern."""
+"""Kilometres north of the points of blocks 1, 2 and 3: of block 1 the northern pair alone sees two rows, both pairs two, the southern two."""
 EXTERNAL_CONTROL = ("GP59", "GP60", "GP61", "GP62")
 CONTROL_CE90_LE90_M = 1.0
 

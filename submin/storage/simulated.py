@@ -41,7 +41,7 @@ def write_region(region: SimulatedRegion, path: str | Path, *, overwrite: bool =
         observed = np.column_stack([region.sample, region.line])
         sigma = np.column_stack([region.sigma_sample, region.sigma_line])
         priors = {image.block_id: region.design.priors for image in region.images}
-        _write_blocks(writer, region.images, priors, region.point_ids[region.point], region.image, observed, sigma)
+        _write_blocks(writer, _blocks(region.images, priors, region.point_ids[region.point], region.image, observed, sigma))
         writer.write_priors(region.design.priors)
         points = PointTable(region.point_ids, region.truth, np.zeros((len(region.point_ids), 3, 3)), quadrants(region.truth, region.design))
         writer.write_points("truth", points)
@@ -69,8 +69,7 @@ def write_scene(scene: SimulatedScene, path: str | Path, *, overwrite: bool = Fa
     """
     layout = scene.layout
     with CatalogueWriter(path, CatalogueMetadata(name=f"simulated {layout.name}, seed {scene.seed}"), overwrite) as writer:
-        sigma = np.full(scene.observed.shape, layout.sigma_px)
-        _write_blocks(writer, layout.images, layout.priors, layout.point_ids[layout.point], layout.image, scene.observed, sigma)
+        _write_blocks(writer, scene_blocks(scene))
         most, others = _default_and_others(layout.priors)
         writer.write_priors(most, others)
         exact = np.zeros((len(layout.point_ids), 3, 3))
@@ -101,27 +100,39 @@ def _default_and_others(priors: Mapping[str, APriori]) -> tuple[APriori, dict[st
     return default, {block_id: model for block_id, model in priors.items() if model != default}
 
 
-def _write_blocks(
-    writer: CatalogueWriter, images: Sequence[SimulatedImage], priors: Mapping[str, APriori], point_ids: Ids, image: Index,
-    observed: Array, sigma: Array,
-) -> None:  # fmt: skip
-    """Write images, ordered by block, and their blocks, cut out of rays that are sorted by image."""
+def scene_blocks(scene: SimulatedScene) -> list[Block]:
+    """The blocks of a scene, as its catalogue holds them."""
+    layout = scene.layout
+    sigma = np.full(scene.observed.shape, layout.sigma_px)
+    return _blocks(layout.images, layout.priors, layout.point_ids[layout.point], layout.image, scene.observed, sigma)
+
+
+def _blocks(
+    images: Sequence[SimulatedImage], priors: Mapping[str, APriori], point_ids: Ids, image: Index, observed: Array, sigma: Array
+) -> list[Block]:
+    """Blocks in order, cut out of rays that are sorted by image; images are ordered by block."""
     records = [ImageRecord(**asdict(image)) for image in images]
-    writer.write_images(records)
     block_ids = np.array([record.block_id for record in records])
     edges = [0, *(np.flatnonzero(block_ids[1:] != block_ids[:-1]) + 1).tolist(), len(records)]
     rays = np.searchsorted(image, edges).tolist()
-    for start, stop, first, last in zip(edges[:-1], edges[1:], rays[:-1], rays[1:], strict=True):
-        writer.write_block(
-            Block(
-                block_id=str(block_ids[start]),
-                images=tuple(records[start:stop]),
-                a_priori=priors[str(block_ids[start])],
-                point_ids=point_ids[first:last],
-                image=image[first:last] - np.int32(start),
-                sample=observed[first:last, 0],
-                line=observed[first:last, 1],
-                sigma_sample=sigma[first:last, 0],
-                sigma_line=sigma[first:last, 1],
-            )
+    return [
+        Block(
+            block_id=str(block_ids[start]),
+            images=tuple(records[start:stop]),
+            a_priori=priors[str(block_ids[start])],
+            point_ids=point_ids[first:last],
+            image=image[first:last] - np.int32(start),
+            sample=observed[first:last, 0],
+            line=observed[first:last, 1],
+            sigma_sample=sigma[first:last, 0],
+            sigma_line=sigma[first:last, 1],
         )
+        for start, stop, first, last in zip(edges[:-1], edges[1:], rays[:-1], rays[1:], strict=True)
+    ]
+
+
+def _write_blocks(writer: CatalogueWriter, blocks: Sequence[Block]) -> None:
+    """Write blocks and their images."""
+    writer.write_images(image for block in blocks for image in block.images)
+    for block in blocks:
+        writer.write_block(block)
