@@ -57,8 +57,11 @@ class Solution:
         return joint_covariance(self.loading[axes], self.own[rows], self.images.covariance)
 
 
-def solve(blocks: Iterable[Block]) -> Solution:
-    """Adjust some blocks, control among them, as one bundle: registered, judged, linearised at the solution, factored."""
+def solve(blocks: Iterable[Block], judged: bool = True) -> Solution:
+    """Adjust some blocks, control among them, as one bundle: registered, judged, linearised at the solution, factored.
+
+    Without judgement every ray and camera is taken as good, and the bundle is linearised once, at its registration.
+    """
     blocks = list(blocks)
     members = [image for block in blocks for image in network_images(block)]
     images = image_set(members, WGS84, width_of(image.sensor for image in members))
@@ -69,13 +72,17 @@ def solve(blocks: Iterable[Block]) -> Solution:
     sigma = np.concatenate([np.column_stack([block.sigma_sample, block.sigma_line]) for block in blocks])
     rays = sorted_rays(point.astype(np.int32), image, observed, sigma, np.ones(len(image), dtype=np.bool_))
     origin = intersect(images, rays, len(ids)).geocentric
-    adjusted = adjust(images, rays, origin)
-    images = images.release(adjusted.released)
-    linear = linearise(images, rays, adjusted.theta, adjusted.ground, origin)
-    weight = adjusted.accepted.astype(np.float64)
+    accepted, released = rays.accepted, np.zeros(len(images), dtype=np.bool_)
+    if judged:
+        adjusted = adjust(images, rays, origin)
+        accepted, released = adjusted.accepted, adjusted.released
+        linear = linearise(images, rays, adjusted.theta, adjusted.ground, origin)
+    else:
+        linear = linearise(images, rays, np.zeros((len(images), images.parameters)), origin, origin)
+    images, weight = images.release(released), accepted.astype(np.float64)
     state = factor(eliminate(linear, weight, len(images)), np.arange(len(images), dtype=np.int32), images)
     part = GroundPart(origin, linear, point_factors(linear, weight))
     return Solution(
         ids, locate(part, state), loadings([part], state.images, images.parameters), part.factors.own, state,
-        int((~adjusted.accepted).sum()), int(adjusted.released.sum()),
+        int((~accepted).sum()), int(released.sum()),
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,11 +48,12 @@ def data(claim: str, remark: str, found: float) -> dict[str, Any]:
     return {"claim": claim, "wanted": remark, "found": found, "verdict": "data"}
 
 
-def network_of(catalogue: Catalogue, place: Path, blocks: Iterable[Block], blocks_a_batch: int = 1, tile_km: float = ONE_TILE_KM) -> str:
-    """A new network with these blocks fused in this order, so many a commit; its place."""
+def network_of(catalogue: Catalogue, place: Path, batches: Iterable[Sequence[Block]], tile_km: float = ONE_TILE_KM) -> str:
+    """A new network with these blocks fused in this order, a batch to a commit; its place."""
     area, _, _ = fit_catalogue(catalogue)
     create(str(place), area, catalogue.metadata, tile_km, min(100.0, 0.5 * tile_km))
-    tally = fuse_blocks(blocks, str(place), SerialExecutor(), blocks_a_batch, Silent())
-    if tally.rejected:
-        raise RuntimeError(f"rejected: {tally.rejected[0].block_id}: {tally.rejected[0].reason}")
+    for batch in batches:
+        tally = fuse_blocks(batch, str(place), SerialExecutor(), len(batch), Silent())
+        if tally.rejected:
+            raise RuntimeError(f"rejected: {tally.rejected[0].block_id}: {tally.rejected[0].reason}")
     return str(place)

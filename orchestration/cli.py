@@ -181,7 +181,7 @@ def simulate_five_blocks_command(
 def simulate_worldview_command(
     catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")], seed: Seed = 0, as_json: Json = False
 ) -> None:
-    """Simulate the 2010 paper's experiment: 50 WorldView-1 pairs, 1,347 points, 101 surveyed check points, nine of them as control-external.
+    """Simulate the 2010 paper's experiment: 50 WorldView-1 pairs, 1,347 points, 101 of them surveyed, nine of these in control-external.
 
     Example: submin simulate worldview --out catalogue
     """

@@ -80,7 +80,7 @@ PAIRS = (
     Pair(4, 62.5, 120.0), Pair(5, 19.0, 73.0),
 )  # fmt: skip
 ROWS = (69.0, 56.0, 44.0, 31.0, 19.0, 6.0)
-"""Kilometres north of the points of blocks 1, 2 and 3: of block 1 the northern pair alone sees two rows, both pairs two, the southern two."""
+"""Kilometres north of the points of blocks 1 to 3: in block 1 two rows are in the northern pair, two in both, two in the southern one."""
 EXTERNAL_CONTROL = ("GP59", "GP60", "GP61", "GP62")
 CONTROL_CE90_LE90_M = 1.0
 

@@ -174,9 +174,9 @@ def worldview() -> Layout:
     ).with_rays(np.repeat(measured.T, 2, axis=0))
 
 
-def cell_of(image: SimulatedImage) -> str:
+def cell_of(image_id: str) -> str:
     """Cell of an image."""
-    return image.image_id.rsplit("-", 2)[0]
+    return image_id.rsplit("-", 2)[0]
 
 
 def _strips(cell: Cell) -> list[Strip]:
