@@ -102,7 +102,7 @@ def measure(scale: float, workers: int, out: Path | None = None) -> list[dict[st
     with tempfile.TemporaryDirectory() as folder:
         networks = fuse(scene, Path(folder))
     runs = max(round(RUNS * scale), 1)
-    predicted = predictions(layout, networks, scene_blocks(scene))
+    predicted = predictions(layout, networks.pairs, networks.sparse, scene_blocks(scene))
     measured: dict[str, list[Errors]] = {name: [] for name in TABLES}
     nees, lost = [], 0
     for seed in range(runs):
@@ -197,12 +197,14 @@ def single_pairs(blocks: Sequence[Block]) -> Iterator[Block]:
             )
 
 
-def predictions(layout: Layout, networks: Networks, blocks: Sequence[Block]) -> dict[str, tuple[float, float]]:
-    """Average CE90 and LE90 of each table: over all points, and in Edwards Middle."""
+def predictions(layout: Layout, fused: ControlSet, sparse: ControlSet, blocks: Sequence[Block]) -> dict[str, tuple[float, float]]:
+    """Average CE90 and LE90 of each table: over all points, and in Edwards Middle.
+
+    ``fused`` and ``sparse`` answer for all points, the latter with sparse control; ``blocks`` are taken apart into single pairs.
+    """
     alone = np.concatenate([solve([pair], judged=False).local_covariance for pair in single_pairs(blocks)])
     middle = layout.area == MIDDLE
-    fused, sparse = networks.pairs.local_covariance, networks.sparse.local_covariance
-    parts = (alone, fused, fused[middle], sparse[middle])
+    parts = (alone, fused.local_covariance, fused.local_covariance[middle], sparse.local_covariance[middle])
     return {name: (float(ce90(p[:, :2, :2]).mean()), float(le90(p[:, 2, 2]).mean())) for name, p in zip(TABLES, parts, strict=True)}
 
 

@@ -152,6 +152,7 @@ def simulate_region_command(
 
     if not 0.01 <= scale <= 100.0:
         raise InputError(f"--scale is {scale:g}; expected 0.01 to 100")
+    check_range("--seed", seed, 0)
     side = 400.0 * scale**0.5
     region = simulate_region(RegionDesign(width_km=side, height_km=side, seed=seed))
     write_region(region, catalogue)
