@@ -27,7 +27,7 @@ BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
 
 def command(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run; without one they are listed.")] = None,
-    scale: Annotated[float, typer.Option(help="Part of the full size.")] = 1.0,
+    scale: Annotated[float, typer.Option(help="Part of the full size; five-blocks, worldview: of the realisations.")] = 1.0,
     workers: Annotated[int, typer.Option(help="Worker processes.")] = 2,
     kills: Annotated[int | None, typer.Option(min=1, help="faults: number of kills.")] = None,
     seed: Annotated[int | None, typer.Option(help="faults: seed of the moments; default: drawn, and said.")] = None,

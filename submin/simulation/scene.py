@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import datetime
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -49,6 +49,18 @@ class SimulatedImage:
     def seconds(self) -> float:
         """Time of acquisition in seconds since 1970."""
         return datetime.datetime.fromisoformat(self.acquired).timestamp()
+
+
+def simulated_image_set(images: Sequence[SimulatedImage], priors: Mapping[str, APriori], ellipsoid: Ellipsoid = WGS84) -> ImageSet:
+    """Images with their cameras and a priori models (by block), read back from the text that a catalogue would hold."""
+    members = [
+        NetworkImage(
+            i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds,
+            json.dumps(priors[i.block_id].to_mapping()),
+        )
+        for i in images
+    ]  # fmt: skip
+    return image_set(members, ellipsoid, width_of(image.sensor for image in images))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,17 +115,8 @@ class Layout:
 
     @cached_property
     def image_set(self) -> ImageSet:
-        """The images with their cameras and a priori models, read back from what a catalogue would hold."""
-        return image_set(
-            [
-                NetworkImage(
-                    i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds,
-                    json.dumps(self.priors[i.block_id].to_mapping()),
-                )
-                for i in self.images
-            ],
-            self.ellipsoid, width_of(image.sensor for image in self.images),
-        )  # fmt: skip
+        """The images with their cameras and a priori models."""
+        return simulated_image_set(self.images, self.priors, self.ellipsoid)
 
     def with_rays(self, measured: NDArray[np.bool_]) -> Layout:
         """The layout with a ray where ``measured`` (m, n) is true."""
@@ -154,11 +157,16 @@ def realise(layout: Layout, seed: int) -> SimulatedScene:
     """Draw the errors of a layout; the same layout and seed give the same scene, bit by bit."""
     rng = np.random.default_rng(seed)
     images = layout.image_set
-    theta = (images.prior @ rng.standard_normal(images.prior.shape[1])).reshape(len(images), images.parameters)
+    theta = drawn_parameters(images, rng)
     ground = images.ground(geodetic_to_geocentric(layout.truth, layout.ellipsoid))
     exact = images.project(theta, ground, layout.image, layout.point).image
     noise = layout.sigma_px * rng.standard_normal(exact.shape)
     return SimulatedScene(layout, seed, theta, exact + noise, rng.standard_normal(layout.truth.shape))
+
+
+def drawn_parameters(images: ImageSet, rng: np.random.Generator) -> Array:
+    """True corrections (m, p) of images, drawn from their a priori model."""
+    return np.asarray(images.prior @ rng.standard_normal(images.prior.shape[1])).reshape(len(images), images.parameters)
 
 
 def visible(images: ImageSet, size: Array, truth: Array) -> NDArray[np.bool_]:
