@@ -19,8 +19,8 @@ from rich.table import Table
 from orchestration.stopping import Stopped, signals_stop
 
 if TYPE_CHECKING:
-    from submin.storage.imports import ImportSummary
     from submin.simulation.scene import Layout
+    from submin.storage.imports import ImportSummary
     from submin.storage.network_store import Version
 
 app = typer.Typer(
