@@ -1,32 +1,37 @@
-"""``python -m benchmarks`` lists the benchmarks; ``python -m benchmarks NAME [--json] [--scale F] [--workers N]`` runs one."""
+"""``python -m benchmarks`` lists the benchmarks; ``python -m benchmarks NAME [--json] [--scale F] [--workers N] [--out DIR]`` runs one."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Callable
+from itertools import groupby
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import faults, main_job, stage_one
+from benchmarks import faults, five_blocks, main_job, stage_one, worldview
 from benchmarks.machine import machine
 
 BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "main-job": ("the rate of every station from rays to a committed network", main_job.measure),
     "stage-1": ("projection, and a triplet through stage 1: fast, and linear in rays", stage_one.measure),
     "faults": ("a run whose processes are killed leaves the network of an undisturbed one", faults.measure),
+    "five-blocks": ("Tables 2 and 3 of the 2008 paper; sequential = simultaneous; consistent", five_blocks.measure),
+    "worldview": ("Tables 3 to 6 of the 2010 paper; pair = cell = simultaneous; time a pair", worldview.measure),
 }
 
 
 def command(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run; without one they are listed.")] = None,
-    scale: Annotated[float, typer.Option(help="Part of the full size.")] = 1.0,
+    scale: Annotated[float, typer.Option(help="Part of the full size; five-blocks, worldview: of the realisations.")] = 1.0,
     workers: Annotated[int, typer.Option(help="Worker processes.")] = 2,
     kills: Annotated[int | None, typer.Option(min=1, help="faults: number of kills.")] = None,
     seed: Annotated[int | None, typer.Option(help="faults: seed of the moments; default: drawn, and said.")] = None,
+    figures: Annotated[Path | None, typer.Option("--out", help="five-blocks, worldview: folder for figures.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Run a benchmark and print it beside the machine that it ran on."""
@@ -37,18 +42,23 @@ def command(
         return
     if name not in BENCHMARKS:
         raise typer.BadParameter(f"{name!r}; expected one of {', '.join(BENCHMARKS)}")
-    more = {option: value for option, value in (("kills", kills), ("seed", seed)) if value is not None}
+    more: dict[str, Any] = {option: value for option, value in (("kills", kills), ("seed", seed)) if value is not None}
     if more and name != "faults":
         raise typer.BadParameter(f"--{next(iter(more))} is an option of faults")
+    if figures is not None:
+        if name not in ("five-blocks", "worldview"):
+            raise typer.BadParameter("--out is an option of five-blocks and worldview")
+        more["out"] = figures
     rows = BENCHMARKS[name][1](scale, workers, **more)
     host = machine()
     if as_json:
         sys.stdout.write(json.dumps({"benchmark": name, "scale": scale, "machine": host, "rows": rows}) + "\n")
         return
-    table = Table(*rows[0])
-    for row in rows:
-        table.add_row(*(f"{v:,.4g}" if isinstance(v, float) else f"{v:,}" if isinstance(v, int) else str(v) for v in row.values()))
-    out.print(table)
+    for columns, alike in groupby(rows, tuple):  # rows of other columns are another table
+        table = Table(*columns)
+        for row in alike:
+            table.add_row(*(f"{v:,.4g}" if isinstance(v, float) else f"{v:,}" if isinstance(v, int) else str(v) for v in row.values()))
+        out.print(table)
     out.print(", ".join(f"{key} {value}" for key, value in host.items()), soft_wrap=True)
 
 

@@ -21,11 +21,10 @@ from orchestration.run import run
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.elimination import eliminate, linearise, point_factors
 from submin.adjustment.estimation import estimate_images
-from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
 from submin.sensors import sensor_named
-from submin.simulation.region import RegionDesign, image_priors, packed_cameras, simulate_region
+from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.simulated import write_region
 
@@ -36,10 +35,7 @@ def measure(scale: float, workers: int) -> list[dict[str, Any]]:
     """Rows of station, size, seconds and rate."""
     side = 400.0 * scale**0.5
     region = simulate_region(RegionDesign(width_km=side, height_km=side))
-    images = ImageSet(
-        tuple(i.image_id for i in region.images), tuple(i.sensor for i in region.images), packed_cameras(region.images),
-        tuple(image_priors(region.images, region.design.priors)), len(RPC.parameters),
-    )  # fmt: skip
+    images = region.image_set
     rays = sorted_rays(
         region.point, region.image, np.column_stack([region.sample, region.line]),
         np.column_stack([region.sigma_sample, region.sigma_line]), np.ones(len(region.point), dtype=np.bool_),

@@ -14,7 +14,7 @@ from orchestration.tasks import BlockRays, adjust_block
 from submin.geodesy import WGS84, geodetic_to_geocentric
 from submin.network.network_image import NetworkImage
 from submin.sensors import Ground, sensor_named
-from submin.simulation.region import RegionDesign, SimulatedRegion, packed_cameras, simulate_region
+from submin.simulation.region import RegionDesign, SimulatedRegion, simulate_region
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def _checked(block: BlockRays) -> None:
 
 
 def _projection(region: SimulatedRegion, rays: int) -> Callable[[], Any]:
-    sensor, cameras = sensor_named("rpc"), packed_cameras(region.images)
+    sensor, cameras = sensor_named("rpc"), region.packed_cameras()
     times = -(-rays // len(region.image))
     image, point = (np.tile(index, times)[:rays] for index in (region.image, region.point))
     at = np.tile(np.column_stack([region.sample, region.line]), (times, 1))[:rays]

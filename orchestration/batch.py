@@ -125,7 +125,7 @@ def _register(
     while True:
         rays = _arriving(blocks, accepted, base.image_count())
         move = place(
-            base, take_points(base, np.unique(rays.point_ids)), rays, [image for block in blocks for image in _network_images(block)]
+            base, take_points(base, np.unique(rays.point_ids)), rays, [image for block in blocks for image in network_images(block)]
         )  # fmt: skip
         bad = _misplaced(blocks, rays, move)
         if not bad:
@@ -165,7 +165,8 @@ def _inside_when_swapped(ids: NDArray[np.str_], move: Move) -> bool:
     return 2 * int(inside.sum()) > len(inside)
 
 
-def _network_images(block: Block) -> tuple[NetworkImage, ...]:
+def network_images(block: Block) -> tuple[NetworkImage, ...]:
+    """The images of a block as a network keeps them."""
     a_priori = "" if block.a_priori is None else json.dumps(block.a_priori.to_mapping(), sort_keys=True)
     return tuple(
         NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, a_priori) for i in block.images
@@ -173,7 +174,7 @@ def _network_images(block: Block) -> tuple[NetworkImage, ...]:
 
 
 def _block_rays(block: Block) -> BlockRays:
-    return BlockRays(block.block_id, _network_images(block), block.point_ids, block.image, _observed(block), _sigma(block))
+    return BlockRays(block.block_id, network_images(block), block.point_ids, block.image, _observed(block), _sigma(block))
 
 
 def _observed(block: Block) -> NDArray[np.float64]:

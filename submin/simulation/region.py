@@ -19,17 +19,20 @@ import datetime
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.priors import APriori, ImagePrior, prior_factor
+from submin.adjustment.images import ImageSet
+from submin.adjustment.priors import APriori
 from submin.errors import InputError
 from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
 from submin.sensors import Ground, sensor_named
 from submin.sensors.footprint import footprints
 from submin.simulation.rpc_fit import fit_rpc
+from submin.simulation.scene import SimulatedImage, drawn_parameters, simulated_image_set, utc
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -163,27 +166,6 @@ class RegionDesign:
         return _centres(self.width_km, self.scene_km, max(round(wanted), int(np.ceil(self.width_km / self.scene_km - 1e-9))))
 
 
-@dataclass(frozen=True)
-class SimulatedImage:
-    """One image as the catalogue describes it: ``camera`` is JSON text, ``acquired`` ISO 8601 text in UTC, ``footprint`` WKB in degrees."""
-
-    image_id: str
-    block_id: str
-    pass_id: str
-    platform: str
-    sensor: str
-    camera: str
-    width: int
-    height: int
-    acquired: str
-    footprint: bytes
-
-    @property
-    def seconds(self) -> float:
-        """Time of acquisition in seconds since 1970."""
-        return datetime.datetime.fromisoformat(self.acquired).timestamp()
-
-
 @dataclass(frozen=True, eq=False)
 class SimulatedRegion:
     """A region with everything that a network may know, and the truth that it must not.
@@ -223,9 +205,14 @@ class SimulatedRegion:
     blunder: NDArray[np.bool_]
     bad_cameras: tuple[str, ...]
 
+    @cached_property
+    def image_set(self) -> ImageSet:
+        """The images with their cameras and a priori models."""
+        return _image_set(self.design, self.images)
+
     def packed_cameras(self) -> Array:
         """Cameras (m, c) as the sensor packs them."""
-        return packed_cameras(self.images)
+        return self.image_set.cameras
 
 
 @dataclass(frozen=True)
@@ -247,13 +234,18 @@ class RegionFrame:
     @classmethod
     def of(cls, design: RegionDesign, ellipsoid: Ellipsoid = WGS84) -> RegionFrame:
         """The frame of a design."""
-        centre = np.array([[design.longitude, design.latitude, 0.0]])
+        return cls.at(design.longitude, design.latitude, design.azimuth, ellipsoid)
+
+    @classmethod
+    def at(cls, longitude: float, latitude: float, azimuth: float, ellipsoid: Ellipsoid = WGS84) -> RegionFrame:
+        """The frame about a centre, with the track's azimuth there; all in degrees."""
+        centre = np.array([[longitude, latitude, 0.0]])
         position = geodetic_to_geocentric(centre, ellipsoid)[0]
         radius = float(np.linalg.norm(position))
         up = position / radius
         east, north, _ = local_axes(centre)[0]
-        azimuth = np.radians(design.azimuth)
-        along = np.sin(azimuth) * east + np.cos(azimuth) * north
+        angle = np.radians(azimuth)
+        along = np.sin(angle) * east + np.cos(angle) * north
         along -= up * (up @ along)
         along /= np.linalg.norm(along)
         return cls(radius, np.stack([up, along, np.cross(up, along)]), ellipsoid)
@@ -337,11 +329,12 @@ def simulate_region(design: RegionDesign) -> SimulatedRegion:
     rng = np.random.default_rng(design.seed)
     images, scene = region_images(design)
     names, along, across, truth = _tie_points(design, rng)
-    theta, bad = _true_parameters(design, images, rng)
+    image_set = _image_set(design, images)
+    theta, bad = _true_parameters(design, image_set, rng)
 
     ray_image, ray_point = _candidates(design, scene, along, across, theta)
     ground = Ground.at(geodetic_to_geocentric(truth))
-    exact = SENSOR.project(packed_cameras(images), theta, ground, ray_image, ray_point).image
+    exact = SENSOR.project(image_set.cameras, theta, ground, ray_image, ray_point).image
     size = np.array([[i.width, i.height] for i in images], dtype=np.float64)[ray_image]
     inside = _inside(exact, size)
     ray_image, ray_point, exact, size = ray_image[inside], ray_point[inside], exact[inside], size[inside]
@@ -376,16 +369,6 @@ def region_images(design: RegionDesign) -> tuple[tuple[SimulatedImage, ...], Arr
     images = tuple(image for scene in scenes for image in _triplet(design, frame, scene))
     centres = np.array([(scene.along_km, scene.across_km) for scene in scenes])
     return images, np.repeat(centres, len(design.views), axis=0)
-
-
-def packed_cameras(images: Sequence[SimulatedImage]) -> Array:
-    """Cameras (m, c) of images as the sensor packs them, read back from the JSON text that a catalogue would hold."""
-    return np.stack([SENSOR.pack(json.loads(image.camera), image.width, image.height) for image in images])
-
-
-def image_priors(images: Sequence[SimulatedImage], a_priori: APriori) -> list[ImagePrior]:
-    """What the a priori factor needs of the images, for `submin.adjustment.priors.prior_factor`."""
-    return [ImagePrior(i.block_id, i.pass_id, i.seconds, a_priori, SENSOR.parameters) for i in images]
 
 
 def terrain_height(along_km: Array, across_km: Array, relief_m: float) -> Array:
@@ -466,7 +449,7 @@ def _acquired(strip: int, angle: float, orbit_radius: float) -> str:
     """ISO text of the time at which a strip's satellite passes an angle of its orbit, to the millisecond."""
     seconds = angle * np.sqrt(orbit_radius**3 / GRAVITY_PARAMETER)
     time = FIRST_PASS + datetime.timedelta(days=DAYS_BETWEEN_PASSES * strip, milliseconds=round(1e3 * seconds))
-    return time.replace(tzinfo=None).isoformat(timespec="milliseconds") + "Z"
+    return utc(time)
 
 
 def _tie_points(design: RegionDesign, rng: np.random.Generator) -> tuple[Ids, Array, Array, Array]:
@@ -481,10 +464,13 @@ def _tie_points(design: RegionDesign, rng: np.random.Generator) -> tuple[Ids, Ar
     return np.char.mod("P%06d", np.arange(len(row))), along, across, truth
 
 
-def _true_parameters(design: RegionDesign, images: Sequence[SimulatedImage], rng: np.random.Generator) -> tuple[Array, Index]:
+def _image_set(design: RegionDesign, images: Sequence[SimulatedImage]) -> ImageSet:
+    return simulated_image_set(images, {image.block_id: design.priors for image in images})
+
+
+def _true_parameters(design: RegionDesign, images: ImageSet, rng: np.random.Generator) -> tuple[Array, Index]:
     """True parameters (m, 6) drawn from the a priori model, and the places of the bad cameras."""
-    factor = prior_factor(image_priors(images, design.priors), len(SENSOR.parameters))
-    theta = (factor @ rng.standard_normal(factor.shape[1])).reshape(len(images), len(SENSOR.parameters))
+    theta = drawn_parameters(images, rng)
     bad = np.sort(rng.choice(len(images), design.bad_cameras, replace=False)).astype(np.int32)
     direction = rng.uniform(0.0, 2.0 * np.pi, design.bad_cameras)
     shift = design.bad_camera_sigmas * design.priors.bias_px * np.stack([np.cos(direction), np.sin(direction)], axis=1)

@@ -133,8 +133,11 @@ class CatalogueWriter:
         blocks = {block_id: a_priori.to_mapping() for block_id, a_priori in (by_block or {}).items()}
         self._json("priors.json", {"default": default.to_mapping(), "blocks": blocks})
 
-    def write_points(self, kind: Literal["control", "check", "truth"], points: PointTable) -> None:
-        """Write control points, check points or simulated truth (of which only the coordinates)."""
+    def write_points(self, kind: Literal["control", "check", "truth"], points: PointTable, suffix: str = "") -> None:
+        """Write control points, check points or simulated truth (of which only the coordinates).
+
+        A table with a ``suffix`` (``control-SUFFIX``) lies beside the catalogue's own one: no run takes it by itself.
+        """
         self._open()
         if kind not in POINT_KINDS:
             raise CatalogueError(f"kind of points is {kind!r}; expected one of {', '.join(POINT_KINDS)}")
@@ -148,7 +151,7 @@ class CatalogueWriter:
             columns |= {name: points.covariance_enu[:, i, j] for name, i, j in zip(COVARIANCE_COLUMNS, row, column, strict=True)}
             if points.joint_covariance is not None:
                 columns["covariance_row"] = covariance_rows(points.joint_covariance, 0, len(points))
-        pq.write_table(pa.table(columns), self._folder / f"{kind}.parquet", compression="zstd")
+        pq.write_table(pa.table(columns), self._folder / f"{kind}{suffix and '-' + suffix}.parquet", compression="zstd")
 
     def _unwritable(self, cause: OSError) -> CatalogueError:
         return CatalogueError(

@@ -242,6 +242,7 @@ simply("no point at most", lambda w: ["query", w.fused, *BOX, "--max-points", 0]
 simply("unknown blocking of an import", lambda w: [*w.importing(), "--blocks", "strip"])
 simply("sigma of an import out of range", lambda w: [*w.isis(), "--sigma", 0])
 simply("scale of a simulation out of range", lambda w: ["simulate", "region", "--out", w.new, "--scale", 0])
+simply("negative seed of a simulation", lambda w: ["simulate", "five-blocks", "--out", w.new, "--seed", -1])
 
 # --- the network ------------------------------------------------------------------------------------------------------------------------
 

@@ -132,3 +132,22 @@ def test_frames_that_do_not_match_are_refused(shell: Shell, place: Path) -> None
     _, err = shell("run", place / "catalogue", place / "moon", code=2)
     assert "frame is 'WGS84', but the network's is 'ITRF2014'" in err
     assert shell.json("info", place / "moon")["version"] == "v0"
+
+
+def test_the_papers_experiments(shell: Shell, tmp_path: Path) -> None:
+    """Simulate, run block by block, check by block, add external control."""
+    catalogue, network = tmp_path / "catalogue", tmp_path / "network"
+    made = shell.json("simulate", "five-blocks", "--out", catalogue)
+    assert (made["images"], made["blocks"], made["points"], made["simulated"]) == (18, 5, 62, True)
+    shell("create", network, "--fit", catalogue, "--tile-km", 1000)
+    assert shell.json("run", catalogue, network, "--sequential")["version"] == "v5"
+    before = shell.json("check", network, catalogue / "check.parquet")
+    assert sorted(before["areas"]) == [f"block {k}" for k in range(1, 6)]
+    assert before["areas"]["block 1"]["points"] == 20 and before["missing"] == 0
+    assert shell.json("control", "add", network, catalogue / "control-external.parquet")["control_fused"] == 4
+    after = shell.json("check", network, catalogue / "check.parquet")
+    assert after["horizontal"]["mean_ce90"] < 0.5 * before["horizontal"]["mean_ce90"]
+
+    made = shell.json("simulate", "worldview", "--out", tmp_path / "worldview", "--seed", 5)
+    assert (made["images"], made["blocks"], made["points"], made["check_points"]) == (100, 49, 1347, 101)
+    assert len(made["external_control"]) == 9
