@@ -175,7 +175,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
             np.empty(0, dtype="U1"), np.empty((0, 3)), np.empty((0, 0)), none, none, "tile" if policy == "auto" else policy, (),
             np.empty(0, dtype=np.int32), True,
         )  # fmt: skip
-    policy, tiles = _choose(source, kept, policy, tile_number)
+    policy, tiles = choose(source, kept, policy, tile_number)
     images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
     state = POLICIES[policy](source, tiles, images, parts)
     held = {cell for t in tiles for cell in source.cover.cells_held(t)}
@@ -195,7 +195,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     )  # fmt: skip
 
 
-def _choose(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None) -> tuple[str, list[int]]:
+def choose(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None) -> tuple[str, list[int]]:
     """The policy to use and the tiles concerned."""
     cover = source.cover
     cells = [s.cell.number for s in selections]
