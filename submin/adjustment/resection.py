@@ -1,7 +1,7 @@
 """Resection: images from ground points held without error, and then the error of the points propagated.
 
-Given the ground points that its images see, a block owes nothing to other blocks. So the images of a block of a network, as one adjustment of
-everything would have them, are its a priori model and its own rays on the network's points (docs/stage-1.md, "Readjustment"),
+Given the ground points that its images see, a block owes nothing to other blocks. So the images of a block of a network, as one
+adjustment of everything has them, follow from their a priori model and their own rays on the network's points (docs/stage-1.md),
 
     Q_c = (Q^-1 + sum A'A)^-1     theta = Q_c sum A'(y - B x)     G = -Q_c sum A'B     M = Q_c + G P G'
 
