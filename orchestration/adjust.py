@@ -189,9 +189,8 @@ def _with_control(
     shown = _spread(np.flatnonzero(known), controlled, count, found.ground, most)
     points = _point_set(judged, shown, found.ground[shown], found.ground_covariance(shown), count, catalogue.metadata, source)
     values = _values(judged, result, int(known.sum()), len(shown), source)
-    values["check"] = None if check is None else _checked(
-        judged, check, np.setdiff1d(np.flatnonzero(known), result.prior.point), found.ground, found.ground_covariance
-    )  # fmt: skip
+    apart = known & ~(controlled & (source.kind == "survey"))  # a surveyed point cannot check itself
+    values["check"] = None if check is None else _checked(judged, check, np.flatnonzero(apart), found.ground, found.ground_covariance)
     rays = np.bincount(judged.rays.image[judged.rays.accepted], minlength=len(judged.images))
     return Adjusted(AdjustedCameras(judged.images, found.theta, found.covariance, result.released, rays), points, values)
 

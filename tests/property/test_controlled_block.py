@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 from networks import SMALL, area_of, fuse
 from numpy.typing import NDArray
 
 import submin
-from submin.adjustment.control import ControlledEstimate, ControlledPrior, estimate, innovation_test
+from submin.adjustment.control import ControlledEstimate, ControlledPrior, correlated, estimate, innovation_test, surveyed
 from submin.adjustment.elimination import LinearRays, Sums
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori
+from submin.errors import InputError
 from submin.network.cell import Cell, linear_rays, summed
 from submin.network.sub_min import SubMin, add_sums, factor
 from submin.query.block_control import control_of_block
@@ -168,3 +170,92 @@ def test_a_controlled_block_is_the_block_fused(case: Case) -> None:
     assert found.chi_square == pytest.approx(after.chi_square - before.chi_square, rel=1e-8)
     assert found.redundancy == after.redundancy - before.redundancy
     assert (test.d2, test.dof) == (pytest.approx(found.chi_square - free.chi_square, rel=1e-8), found.redundancy - free.redundancy)
+
+
+STEP = 1e4
+"""The estimate is linear: a large step keeps round-off of geocentric coordinates small."""
+
+
+def exact(case: Case, prior: ControlledPrior, covariance: Array) -> tuple[Array, Array]:
+    """Stated and true covariance of corrections and points, when the control's errors have this one (3k, 3k), one datum after another.
+
+    The estimate is linear in measurements, control and the images' expected corrections, and errors of these are all that it has.
+    """
+
+    def answer(y: Array, control: Array, theta: Array) -> Array:
+        known = replace(prior, position=prior.position + control.reshape(-1, 3), theta=theta.reshape(prior.theta.shape))
+        origin = case.origin.copy()
+        origin[prior.point] = known.position
+        linear = case.moved(origin)
+        active = np.ones(len(prior.point), dtype=np.bool_)
+        found = estimate(replace(linear, y=linear.y + y.reshape(-1, 2)), np.ones(len(linear.y)), known, active, origin)
+        return np.concatenate([found.theta.ravel(), (found.ground - case.origin).ravel()])
+
+    start = [np.zeros(case.linear.y.size), np.zeros(3 * len(prior.point)), prior.theta.ravel()]
+    base, maps = answer(*start), []
+    for which, values in enumerate(start):
+        columns = [
+            (answer(*(part + STEP * (np.arange(len(part)) == k) if at == which else part for at, part in enumerate(start))) - base) / STEP
+            for k in range(len(values))
+        ]
+        maps.append(np.array(columns).T)
+    a_priori = case.images.prior.toarray()
+    by_rays, by_control, by_images = maps
+    true = by_rays @ by_rays.T + by_control @ covariance @ by_control.T + by_images @ a_priori @ a_priori.T @ by_images.T
+
+    found, _ = case.adjusted(prior)
+    every = np.arange(len(case.ids))
+    root = np.concatenate([found.image_root, found.ground_root(every)])
+    stated = root @ root.T
+    stated[found.theta.size :, found.theta.size :] = found.ground_covariance(every)
+    return stated, true
+
+
+@pytest.mark.parametrize("case", ["independent images"], indirect=True)
+def test_control_without_its_correlations_claims_too_much(case: Case) -> None:
+    """The whole covariance of the control is what makes the answer consistent; 3 x 3 blocks of it are not enough."""
+    prior = case.prior()
+    k, joint = np.arange(len(prior.point)), prior.covariance
+    blocks = joint.reshape(len(k), 3, len(k), 3)[k, :, k, :]
+    kept = case.images.prior, case.images.parameters, prior.point, prior.position
+    largest = {}
+    for name, known in {"full": correlated(*kept, joint), "factored": prior, "diagonal": surveyed(*kept, blocks)}.items():
+        stated, true = exact(case, known, joint)
+        largest[name] = float(la.eigh(true, stated, eigvals_only=True)[-1])
+    assert largest["full"] <= 1.0 + 1e-6
+    assert largest["factored"] <= 1.0 + 1e-6
+    assert largest["diagonal"] > 5.0, largest
+
+
+@pytest.mark.parametrize("case", ["independent images"], indirect=True)
+def test_a_dense_covariance_is_as_good_as_a_factored_one(case: Case) -> None:
+    """What a query wrote to a file controls as the network itself does."""
+    prior = case.prior()
+    one, _ = case.adjusted(prior)
+    other, _ = case.adjusted(correlated(case.images.prior, case.images.parameters, prior.point, prior.position, prior.covariance))
+    every = np.arange(len(case.ids))
+    sigma = np.sqrt(np.diag(one.ground_covariance(every)))
+    close(other.ground.ravel(), one.ground.ravel(), sigma)
+    close(other.ground_covariance(every), one.ground_covariance(every), sigma * sigma[:, None])
+    np.testing.assert_allclose(other.statistic, one.statistic, rtol=1e-6, atol=1e-9)
+    assert other.chi_square == pytest.approx(one.chi_square, rel=1e-9)
+
+
+@pytest.mark.parametrize("case", ["independent images"], indirect=True)
+def test_singular_control(case: Case) -> None:
+    """Points with one error in common, and points without error: the limits of regular control, which inverting P would not reach."""
+    prior = case.prior()
+    k = len(prior.point)
+    common = np.tile(np.eye(3), (k, k)) * 4.0
+    for joint, ridge in ((common, 1e-9 * np.eye(3 * k)), (np.zeros((3 * k, 3 * k)), 1e-12 * np.eye(3 * k))):
+        kept = case.images.prior, case.images.parameters, prior.point, prior.position
+        singular, _ = case.adjusted(correlated(*kept, joint))
+        regular, _ = case.adjusted(correlated(*kept, joint + ridge))
+        sigma = np.sqrt(np.diag(singular.covariance))
+        close(singular.theta.ravel(), regular.theta.ravel(), sigma, 1e-4)
+        close(singular.covariance, regular.covariance, sigma * sigma[:, None], 1e-4)
+    held = singular.ground[prior.point]
+    np.testing.assert_allclose(held, prior.position, rtol=0, atol=1e-6)
+    assert np.abs(singular.ground_covariance(prior.point)).max() < 1e-12
+    with pytest.raises(InputError, match="is not positive semi-definite"):
+        correlated(*kept, common - np.eye(3 * k))
