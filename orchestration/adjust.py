@@ -17,7 +17,7 @@ from orchestration.run import check_frames
 from orchestration.tasks import adjust_block
 from submin.accuracy import accuracy_against_truth, nees_per_dof
 from submin.adjustment.control import ControlledPrior, correlated, surveyed, uncontrolled
-from submin.adjustment.controlled_adjustment import ControlledAdjustment, adjust_controlled
+from submin.adjustment.controlled_adjustment import FAR_METRES, ControlledAdjustment, adjust_controlled
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import Rays, sorted_rays
@@ -250,9 +250,7 @@ def _values(judged: _Judged, result: ControlledAdjustment, points: int, shown: i
         "status": "contradicted" if contradicted else "controlled" if used else "uncontrolled",
         "innovation": {"d2": test.d2, "dof": test.dof, "probability": test.probability},
         "control_rejected": [
-            {"point_id": str(ids[k]), "reason": f"the block contradicts it: chi-square {result.statistic[k]:.1f} with {result.dof[k]} "
-             "degrees of freedom; wrong point, blunder in its only ray, or wrong covariance: it was used as a tie point"}
-            for k in left_out
+            {"point_id": str(ids[k]), "reason": _why(result.statistic[k], result.dof[k])} for k in left_out
         ],
         "images_flagged": [
             {"image_id": judged.images.ids[i], "reason": f"its corrections contradict its a priori model (test statistic "
@@ -261,6 +259,16 @@ def _values(judged: _Judged, result: ControlledAdjustment, points: int, shown: i
         ],
         "rejected_rays": _rejected(judged), "rays": int(judged.rays.accepted.sum()), "iterations": result.iterations, "use": RULE_0,
     }  # fmt: skip
+
+
+def _why(statistic: float, dof: int) -> str:
+    """Why a control point was left out."""
+    found = (
+        f"the block contradicts it: chi-square {statistic:.1f} with {dof} degrees of freedom"
+        if np.isfinite(statistic)
+        else f"the block's rays pass it by more than {FAR_METRES / 1000.0:g} km"
+    )
+    return f"{found}; another point, a blunder in its only ray, or a wrong covariance: it was used as a tie point"
 
 
 def _rejected(judged: _Judged) -> list[dict[str, str]]:

@@ -22,6 +22,8 @@ Flags = NDArray[np.bool_]
 MAX_ITERATIONS = 40
 MAX_DECISIONS = 200
 """Rounds of leaving out control and releasing cameras; every round decides at least one for good."""
+FAR_METRES = 1000.0
+"""Control that all of the block's rays to it pass by more than this, unadjusted, is of another place: no linearisation reaches so far."""
 COMPANY = 0.5
 """Control that contradicts the block half as much as the worst of it does is left out together with it."""
 
@@ -35,7 +37,7 @@ class ControlledAdjustment:
     estimate : images and points with their covariances, at the last linearisation
     prior : the state that it started from, with the cameras that were released
     active : (k,) False for control points that were left out because they contradict the block
-    statistic, dof : (k,) test of each control point when it was last judged
+    statistic, dof : (k,) test of each control point when it was last judged; infinite for one farther off than `FAR_METRES`
     released : (m,) images whose a priori model was given up because their camera is bad
     image_statistic : (m,) largest test statistic of each image against its a priori model when it was last judged
     test : of all active control points together
@@ -70,9 +72,9 @@ def adjust_controlled(images: ImageSet, rays: Rays, start: Array, prior_of: Call
         When it does not converge, or its information is not positive definite.
     """
     prior, weight = prior_of(images), rays.accepted.astype(np.float64)
-    active = np.ones(len(prior.point), dtype=np.bool_)
+    active = _near(images, rays, prior, len(start))
     released, image_statistic = np.zeros(len(images), dtype=np.bool_), np.zeros(len(images))
-    statistic, dof = np.zeros(len(active)), np.zeros(len(active), dtype=np.int64)
+    statistic, dof = np.where(active, 0.0, np.inf), np.zeros(len(active), dtype=np.int64)
     origin = start.copy()
     origin[prior.point] = prior.position
     theta, ground, iterations = prior.theta, origin, 0
@@ -97,6 +99,26 @@ def adjust_controlled(images: ImageSet, rays: Rays, start: Array, prior_of: Call
         images = images.release(bad)
         prior = prior_of(images)
     raise NumericalError("the adjustment with control does not come to rest: too much of it contradicts the block; check its point ids")
+
+
+def _near(images: ImageSet, rays: Rays, prior: ControlledPrior, points: int) -> Flags:
+    """Control points (k,) that the rays to them do not pass by kilometres."""
+    of_point = np.full(points, -1)
+    of_point[prior.point] = np.arange(len(prior.point))
+    control = of_point[rays.point]
+    row = np.flatnonzero((control >= 0) & rays.accepted)
+    near = np.ones(len(prior.point), dtype=np.bool_)
+    if len(row):
+        projection = images.project(
+            prior.theta, images.ground(prior.position), rays.image[row], control[row].astype(np.int32), rays.observed[row]
+        )  # fmt: skip
+        pixel = np.linalg.norm(projection.by_ground, axis=(1, 2)) / np.sqrt(2.0)
+        passing = np.linalg.norm(rays.observed[row] - projection.image, axis=1) / pixel
+        closest = np.full(len(near), np.inf)
+        np.minimum.at(closest, control[row], np.where(np.isfinite(passing), passing, np.inf))
+        seen = np.bincount(control[row], minlength=len(near)) > 0
+        near = ~seen | (closest <= FAR_METRES)
+    return near
 
 
 def _converged(
