@@ -16,7 +16,7 @@ from orchestration.batch import block_rays, disagreement, network_images
 from orchestration.run import check_frames
 from orchestration.tasks import adjust_block
 from submin.accuracy import accuracy_against_truth, nees_per_dof
-from submin.adjustment.control import ControlledPrior, correlated, surveyed, uncontrolled
+from submin.adjustment.control import ControlledPrior, correlated, covariance_factor, surveyed, uncontrolled
 from submin.adjustment.controlled_adjustment import FAR_METRES, ControlledAdjustment, adjust_controlled
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
@@ -229,6 +229,13 @@ def _control(
     if table.joint_covariance is not None:
         at = (3 * row[:, None] + np.arange(3)).ravel()
         joint = table.joint_covariance[np.ix_(at, at)]
+        try:
+            covariance_factor(joint)
+        except SubminError:
+            raise InputError(
+                f"{catalogue.path}/control: the joint covariance (covariance_row) of {len(row)} points is not positive semi-definite; "
+                "expected the one that an adjustment gave"
+            ) from None
         return (lambda images: correlated(images.prior, p, point, position, joint)), _Source("survey", policy="survey")
     axes = local_axes(table.geodetic[row])
     covariance = np.swapaxes(axes, 1, 2) @ table.covariance_enu[row] @ axes

@@ -74,8 +74,8 @@ def readjust_network(
     missing = tuple(name for name in asked if name not in fused)
     wanted = set(asked) - set(missing)
     if not wanted:
-        named = f"block {block!r} is" if block is not None else f"none of the {len(asked)} blocks of {catalogue.path} is"
-        raise InputError(f"{network} {opened.version}: {named} not in the network; 'submin adjust' controls new blocks")
+        named = f"block {block!r} is not" if block is not None else f"none of the {len(asked)} blocks of {catalogue.path} is"
+        raise InputError(f"{network} {opened.version}: {named} in the network; 'submin adjust' controls new blocks")
     block_of, groups = _groups(opened, wanted)
     cells = _cells_of(opened, {int(row) for group in groups for row in group})
     released: list[str] = []

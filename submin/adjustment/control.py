@@ -31,7 +31,7 @@ from scipy.stats import chi2, norm
 from submin.adjustment.blunders import CRITICAL_RAY, TESTABLE
 from submin.adjustment.elimination import LinearRays, eliminate, point_factors
 from submin.adjustment.estimation import cholesky, fill_symmetric
-from submin.errors import InputError, NumericalError
+from submin.errors import NumericalError
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -123,16 +123,10 @@ def correlated(prior: sp.csr_array, parameters: int, point: Rows, position: Arra
 
     Raises
     ------
-    InputError
+    NumericalError
         When the covariance is not positive semi-definite.
     """
-    try:
-        factor = covariance_factor(covariance)
-    except NumericalError:
-        raise InputError(
-            f"the joint covariance of {len(point)} control points is not positive semi-definite; "
-            "expected the covariance that an adjustment gave"
-        ) from None
+    factor = covariance_factor(covariance)
     k, (rows, q) = len(point), prior.shape
     loading = np.zeros((k, 3, q + factor.shape[1]))
     loading[:, :, q:] = factor.reshape(k, 3, -1)

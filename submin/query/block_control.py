@@ -19,7 +19,7 @@ from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.network.cell import Cell, widened_sums
 from submin.network.sub_min import GroundPart, SubMin, add_sums, factor, loadings, locate
-from submin.query.planner import POLICIES, Selection, choose, ground_part, points_named, well_spread
+from submin.query.planner import POLICIES, Selection, check_policy, choose, ground_part, points_named, well_spread
 from submin.query.source import Index, NetworkSource, existing_cells
 from submin.tiling.cover import Cover
 
@@ -81,6 +81,7 @@ def control_of_block(
     QueryError
         When the policy is unknown, or ``tile`` is asked of points that no one tile holds.
     """
+    check_policy(policy)
     selections, _ = points_named(source, ids, cells)
     if most is not None:
         selections = well_spread(selections, most)

@@ -150,6 +150,12 @@ def well_spread(selections: Sequence[Selection], most: int) -> list[Selection]:
     return [s for s in thinned if len(s.rows)]
 
 
+def check_policy(policy: str) -> None:
+    """Raise `QueryError` for a policy that is unknown."""
+    if policy != "auto" and policy not in POLICIES:
+        raise QueryError(f"policy is {policy!r}; expected one of auto, {', '.join(POLICIES)}")
+
+
 def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None = None) -> Answer:
     """Answer for the selected points by a policy.
 
@@ -160,8 +166,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     QueryError
         When the policy is unknown, or ``tile`` is asked of points that no one tile holds.
     """
-    if policy != "auto" and policy not in POLICIES:
-        raise QueryError(f"policy is {policy!r}; expected one of auto, {', '.join(POLICIES)}")
+    check_policy(policy)
     kept: list[Selection] = []
     parts: list[GroundPart] = []
     for selection in selections:

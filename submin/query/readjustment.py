@@ -22,7 +22,7 @@ from submin.adjustment.priors import ImagePrior
 from submin.adjustment.resection import resect
 from submin.network.cell import factors
 from submin.network.sub_min import GroundPart, SubMin, loadings, locate
-from submin.query.planner import POLICIES, Selection, choose
+from submin.query.planner import POLICIES, Selection, check_policy, choose
 from submin.query.source import Index, NetworkSource
 
 Array = NDArray[np.float64]
@@ -97,6 +97,7 @@ def readjust(
     QueryError
         When the policy is unknown, or ``tile`` is asked of points that no one tile holds.
     """
+    check_policy(policy)
     prepared = [(rows, sorted({cell for row in rows.tolist() for cell in cells_of.get(row, ())})) for rows in groups]
     for rows, cells in sorted(prepared, key=lambda group: group[1]):
         yield _readjusted(source, rows, cells, policy, deweight)

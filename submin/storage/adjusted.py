@@ -180,7 +180,7 @@ def refuse_occupied(path: Path) -> None:
 
 
 def refuse_derived(path: str | Path) -> None:
-    """Refuse a table of points that an adjustment or a query wrote, where surveyed ones are expected (Rule 0).
+    """Refuse a table of points that an adjustment wrote, where surveyed ones are expected (Rule 0).
 
     Raises
     ------
@@ -193,8 +193,8 @@ def refuse_derived(path: str | Path) -> None:
         metadata = pq.read_schema(path).metadata or {}
     except (pa.ArrowException, OSError):
         return  # whoever reads it says what is wrong with it
-    if b"use" in metadata or {b"policy", b"scope", b"version"} <= set(metadata):
+    if metadata.get(b"use") == RULE_0.encode():
         raise InputError(
-            f"{path}: holds points that a query or an adjustment gave; expected surveyed points: what comes from rays of a network, "
-            "entered again, would count twice"
+            f"{path}: holds points that an adjustment gave; expected surveyed points: what comes from rays, entered beside them, "
+            "counts twice"
         )

@@ -16,7 +16,7 @@ from submin.adjustment.control import ControlledEstimate, ControlledPrior, corre
 from submin.adjustment.elimination import LinearRays, Sums
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori
-from submin.errors import InputError
+from submin.errors import NumericalError
 from submin.network.cell import Cell, linear_rays, summed
 from submin.network.sub_min import SubMin, add_sums, factor
 from submin.query.block_control import control_of_block
@@ -257,5 +257,5 @@ def test_singular_control(case: Case) -> None:
     held = singular.ground[prior.point]
     np.testing.assert_allclose(held, prior.position, rtol=0, atol=1e-6)
     assert np.abs(singular.ground_covariance(prior.point)).max() < 1e-12
-    with pytest.raises(InputError, match="is not positive semi-definite"):
+    with pytest.raises(NumericalError, match="is not positive semi-definite"):
         correlated(*kept, common - np.eye(3 * k))
