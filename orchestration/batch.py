@@ -96,11 +96,11 @@ def _stage_one(
     """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of control points."""
     of_images = [block for block in blocks if control_point_of(block.block_id) is None]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
-    arguments = [([_block_rays(b) for b in group], base.metadata.ellipsoid) for group in groups]
+    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid) for group in groups]
     handles = executor.submit_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
     accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if control_point_of(b.block_id) is not None}
     for outcome in (outcome for group in executor.results(handles) for outcome in group):
-        reason = outcome.reason or _disagreement(outcome.accepted)
+        reason = outcome.reason or disagreement(outcome.accepted)
         if reason is None:
             accepted[outcome.block_id] = outcome.accepted
         else:
@@ -108,7 +108,7 @@ def _stage_one(
     return accepted
 
 
-def _disagreement(accepted: NDArray[np.bool_]) -> str | None:
+def disagreement(accepted: NDArray[np.bool_]) -> str | None:
     """Why a block whose rays contradict each other stays out: its points would be registered where they are not, against good blocks."""
     if accepted.sum() >= LEAST_AGREEING * len(accepted):
         return None
@@ -166,14 +166,15 @@ def _inside_when_swapped(ids: NDArray[np.str_], move: Move) -> bool:
 
 
 def network_images(block: Block) -> tuple[NetworkImage, ...]:
-    """The images of a block as a network keeps them."""
+    """The images of a block of a catalogue as a network has them."""
     a_priori = "" if block.a_priori is None else json.dumps(block.a_priori.to_mapping(), sort_keys=True)
     return tuple(
         NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, a_priori) for i in block.images
     )
 
 
-def _block_rays(block: Block) -> BlockRays:
+def block_rays(block: Block) -> BlockRays:
+    """A block of a catalogue as stage 1 sees it."""
     return BlockRays(block.block_id, network_images(block), block.point_ids, block.image, _observed(block), _sigma(block))
 
 

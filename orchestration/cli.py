@@ -309,8 +309,10 @@ def control_add(
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
     from orchestration.stopping import resumable
+    from submin.storage.adjusted import refuse_derived
     from submin.storage.point_table import read_point_table
 
+    refuse_derived(points)
     table = read_point_table(points, "definite")
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         added = add_control(table, str(points), network, executor, reporter)
@@ -397,6 +399,99 @@ def query(
     show(values, as_json, f"{len(control):,} points of {network} {control.version}, policy {control.policy} over {len(control.tiles)} "
          f"tile{'s' if len(control.tiles) > 1 else ''} (scope: {control.scope}), "
          f"median CE90 {values['ce90_median']:.3g} m, LE90 {values['le90_median']:.3g} m, {seconds:.2f} s{shown}")  # fmt: skip
+
+
+@app.command()
+def adjust(
+    catalogue: Annotated[Path, typer.Argument(help="Catalogue that holds the block.")],
+    block: Annotated[str, typer.Option("--block", help="Id of the block.")],
+    output: Annotated[Path, typer.Option("--out", help="Folder to write: cameras, their covariance, points, report.")],
+    network: Annotated[
+        str | None, typer.Option("--network", help="Network that controls it; without one the catalogue's control table does, if any.")
+    ] = None,
+    policy: Annotated[str, typer.Option("--policy", help="Of the network's answer: auto, tile, ci or rigorous.")] = "auto",
+    at: Annotated[str | None, typer.Option("--at", help="Version of the network, such as v12.")] = None,
+    max_points: Annotated[
+        int, typer.Option("--max-points", help="Control points taken, and points written with joint covariance, at most.")
+    ] = 2000,
+    virtual_control: Annotated[
+        int | None,
+        typer.Option("--virtual-control", metavar="N", help="N x N virtual control points an image: no accuracy is stated then."),
+    ] = None,
+    virtual_sigma: Annotated[float, typer.Option("--virtual-sigma", help="Positioning accuracy of an image, pixels.")] = 7.5,
+    virtual_weight: Annotated[
+        str, typer.Option("--virtual-weight", help="plain or balanced (times tie points over virtual ones).")
+    ] = "plain",
+    virtual_height: Annotated[
+        float | None, typer.Option("--virtual-height", help="Height of the virtual points, m; default: each camera's mean height.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Adjust one new block: cameras and points with their covariance, controlled by a network. Nothing goes into the network.
+
+    Example: submin adjust catalogue --block PASS_7 --network network --out adjusted
+    """
+    from orchestration.adjust import VirtualDesign, write
+    from orchestration.adjust import adjust as stage_one
+    from submin.storage.adjusted import refuse_occupied
+    from submin.storage.catalogue import Catalogue
+
+    check_range("--max-points", max_points, 1)
+    refuse_occupied(output)
+    design = None if virtual_control is None else VirtualDesign(virtual_control, virtual_sigma, virtual_weight, virtual_height)
+    done = stage_one(Catalogue.open(catalogue), block, network, version=at, policy=policy, most=max_points, virtual=design)
+    write(done, output)
+    values = done.values
+    factor = "" if values["variance_factor"] is None else f", variance factor {values['variance_factor']:.3g}"
+    lines = [
+        f"block {block}: {values['images']} images, {values['points']:,} points, {values['control_points']} control points, "
+        f"{len(values['rejected_rays'])} rays rejected{factor}; {values['status']}; written to {output}"
+    ]
+    if "innovation" in values and values["innovation"]["dof"]:
+        test = values["innovation"]
+        lines.append(
+            f"control against block: chi-square {test['d2']:.1f}, {test['dof']} degrees of freedom, probability {test['probability']:.2g}"
+        )
+    lines += [values["accuracy"]] if design is not None else []
+    lines += [f"bad camera {f['image_id']}: {f['reason']}" for f in values["images_flagged"]]
+    lines += [f"control point {r['point_id']}: {r['reason']}" for r in values["control_rejected"]]
+    show({**values, "out": str(output)}, as_json, "\n".join(lines))
+    if done.partly:
+        raise typer.Exit(1)
+
+
+@app.command()
+def readjust(
+    catalogue: Annotated[Path, typer.Argument(help="Catalogue whose blocks the network has.")],
+    network: Annotated[str, typer.Argument(help="Network with them.")],
+    output: Annotated[Path, typer.Option("--out", help="Folder to write: cameras and their covariance.")],
+    block: Annotated[str | None, typer.Option("--block", help="One block only.")] = None,
+    policy: Annotated[str, typer.Option("--policy", help="Of the network's points: auto, tile, ci or rigorous.")] = "auto",
+    deweight: Annotated[
+        float | None,
+        typer.Option("--deweight", metavar="F", help="For comparison: a priori covariance x F^2 instead of the rigorous form."),
+    ] = None,
+    at: Annotated[str | None, typer.Option("--at", help="Version of the network, such as v12.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Cameras of earlier blocks from the final network (MIN++), as one adjustment of everything would have them.
+
+    Example: submin readjust catalogue network --out cameras
+    """
+    from orchestration.readjust import readjust_network
+    from submin.storage.adjusted import refuse_occupied
+    from submin.storage.catalogue import Catalogue
+
+    refuse_occupied(output)
+    done = readjust_network(Catalogue.open(catalogue), network, output, block=block, policy=policy, deweight=deweight, version=at)
+    values = done.to_json()
+    lines = [
+        f"{done.images} images of {done.blocks} blocks, from the points of {network} {done.version} ({values['status']}); "
+        f"written to {output}"
+    ]
+    if done.blocks_missing:
+        lines.append(f"{len(done.blocks_missing)} blocks are not in the network: {', '.join(done.blocks_missing[:5])}")
+    show({**values, "out": str(output)}, as_json, "\n".join(lines))
 
 
 @app.command()

@@ -150,6 +150,12 @@ def well_spread(selections: Sequence[Selection], most: int) -> list[Selection]:
     return [s for s in thinned if len(s.rows)]
 
 
+def check_policy(policy: str) -> None:
+    """Raise `QueryError` for a policy that is unknown."""
+    if policy != "auto" and policy not in POLICIES:
+        raise QueryError(f"policy is {policy!r}; expected one of auto, {', '.join(POLICIES)}")
+
+
 def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None = None) -> Answer:
     """Answer for the selected points by a policy.
 
@@ -160,8 +166,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     QueryError
         When the policy is unknown, or ``tile`` is asked of points that no one tile holds.
     """
-    if policy != "auto" and policy not in POLICIES:
-        raise QueryError(f"policy is {policy!r}; expected one of auto, {', '.join(POLICIES)}")
+    check_policy(policy)
     kept: list[Selection] = []
     parts: list[GroundPart] = []
     for selection in selections:
@@ -175,7 +180,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
             np.empty(0, dtype="U1"), np.empty((0, 3)), np.empty((0, 0)), none, none, "tile" if policy == "auto" else policy, (),
             np.empty(0, dtype=np.int32), True,
         )  # fmt: skip
-    policy, tiles = _choose(source, kept, policy, tile_number)
+    policy, tiles = choose(source, kept, policy, tile_number)
     images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
     state = POLICIES[policy](source, tiles, images, parts)
     held = {cell for t in tiles for cell in source.cover.cells_held(t)}
@@ -195,7 +200,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     )  # fmt: skip
 
 
-def _choose(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None) -> tuple[str, list[int]]:
+def choose(source: NetworkSource, selections: Sequence[Selection], policy: str, tile_number: int | None) -> tuple[str, list[int]]:
     """The policy to use and the tiles concerned."""
     cover = source.cover
     cells = [s.cell.number for s in selections]

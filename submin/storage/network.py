@@ -37,8 +37,9 @@ class Network:
     ``network = submin.open("network"); control = network.query(bbox=(west, south, east, north))``
     """
 
-    def __init__(self, place: str, version: str | None = None) -> None:
-        self._snapshot = Snapshot.open(place, version)
+    def __init__(self, place: str, version: str | None = None, parameters: int = 0) -> None:
+        """``parameters``: least number of adjustable parameters to keep for each image, for images that are to be joined to it."""
+        self._snapshot = Snapshot.open(place, version, parameters)
         self._cells: OrderedDict[int, Cell] = OrderedDict()
         self._images: dict[int, NetworkImage] = {}
         self._numbers: tuple[int, ...] | None = None

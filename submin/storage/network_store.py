@@ -190,8 +190,8 @@ class Snapshot:
         self.number = int(attributes_of(root)["version"])
 
     @classmethod
-    def open(cls, place: str, version: str | None = None) -> Snapshot:
-        """Open the newest version, or the one named (``v12``, or a tag).
+    def open(cls, place: str, version: str | None = None, parameters: int = 0) -> Snapshot:
+        """Open the newest version, or the one named (``v12``, or a tag), with at least so many parameters an image.
 
         Raises
         ------
@@ -204,7 +204,7 @@ class Snapshot:
         else:
             session = repository.readonly_session(snapshot_id=find_version(place, version).snapshot)
         try:
-            return cls(zarr.open_group(session.store, mode="r"), place)
+            return cls(zarr.open_group(session.store, mode="r"), place, parameters=parameters)
         except FileNotFoundError:
             raise StoreError(f"{place}: holds a repository but no network; make one with 'submin create'") from None
 

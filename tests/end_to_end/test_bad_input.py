@@ -30,6 +30,7 @@ from isis_files import write as write_isis
 from networks import accepted_rays, area_of
 
 import submin
+from orchestration.adjust import adjust, write
 from orchestration.cli import main
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
@@ -816,6 +817,91 @@ def _(w: World) -> list[Any]:
     create(str(w.new), area, catalogue.metadata, 200.0, 20.0, max_parameters=60)
     run(catalogue, str(w.new), SerialExecutor())
     return ["query", w.new, "--tile", "r000c000"]
+
+
+# --- adjusting and readjusting ----------------------------------------------------------------------------------------------------------
+
+
+def adjusting(w: World, *options: Any, network: bool = False) -> list[Any]:
+    """The command that adjusts the first block, by the network that has none of them or by itself."""
+    control = ["--network", w.network] if network else []
+    return ["adjust", w.catalogue, "--block", w.block(), *control, "--out", w.new, *options]
+
+
+simply("adjustment of a block that is in the network", lambda w: [*adjusting(w), "--network", w.fused])
+simply("adjustment of an unknown block", lambda w: ["adjust", w.catalogue, "--block", "B", "--out", w.new])
+simply("adjustment by an unknown policy", lambda w: [*adjusting(w), "--network", halfway(w), "--policy", "best"])
+simply("adjustment with no point at most", lambda w: adjusting(w, "--max-points", 0))
+simply("virtual control beside a network", lambda w: adjusting(w, "--virtual-control", 3, network=True))
+simply("virtual control of unknown weight", lambda w: adjusting(w, "--virtual-control", 3, "--virtual-weight", "heavy"))
+simply("virtual control of too few points", lambda w: adjusting(w, "--virtual-control", 1))
+simply("virtual control out of reach", lambda w: adjusting(w, "--virtual-control", 3, "--virtual-height", "nan"))
+simply("readjustment of a block that is not in the network", lambda w: [*readjusting(w, w.network), "--block", w.block()])
+simply("readjustment of a catalogue that is not in the network", lambda w: readjusting(w, w.network))
+simply("de-weighting that gives weight", lambda w: [*readjusting(w, w.fused), "--deweight", 0.5])
+
+
+def readjusting(w: World, network: Path) -> list[Any]:
+    return ["readjust", w.catalogue, network, "--out", w.new]
+
+
+def halfway(w: World) -> Path:
+    """A network of all blocks but the first."""
+    part = shutil.copytree(w.catalogue, w.folder / "part")
+    for stem in ("images", "measurements"):
+        table = pq.read_table(part / f"{stem}.parquet")
+        pq.write_table(table.filter(pc.not_equal(table["block_id"], w.block())), part / f"{stem}.parquet")
+    run(Catalogue.open(part), str(w.network), SerialExecutor())
+    return w.network
+
+
+@case("adjustment of a block with a ray twice")
+def _(w: World) -> list[Any]:
+    columns = w.columns("measurements")
+    w.put("measurements", {name: [values[0], *values] for name, values in columns.items()})
+    return adjusting(w)
+
+
+@case("adjustment by a network of another frame")
+def _(w: World) -> list[Any]:
+    w.metadata(frame="ITRF2014")
+    return adjusting(w, network=True)
+
+
+@case("control of an adjustment with an impossible joint covariance")
+def _(w: World) -> list[Any]:
+    ids = w.columns("measurements")["point_id"][:2]
+    at = {name: [value, value] for name, value in (("longitude", 100.0), ("latitude", 35.0), ("height", 0.0))}
+    rows = [np.eye(3).ravel().tolist(), np.hstack([5.0 * np.eye(3), np.eye(3)]).ravel().tolist()]
+    w.put("control", {"point_id": sorted(set(ids)) if len(set(ids)) == 2 else [ids[0], "other"], **at, "covariance_row": rows})
+    return adjusting(w)
+
+
+@case("result of an adjustment where something is")
+def _(w: World) -> list[Any]:
+    w.new.mkdir()
+    (w.new / "mine").write_text("mine")
+    return adjusting(w)
+
+
+@case("result of a readjustment where a file is")
+def _(w: World) -> list[Any]:
+    return ["readjust", w.catalogue, w.fused, "--out", w.write("file", "mine")]
+
+
+@case("result of an adjustment in a folder that is read only")
+def _(w: World) -> list[Any]:
+    folder = w.folder / "closed"
+    folder.mkdir()
+    w.around = lambda: read_only(folder)
+    return ["adjust", w.catalogue, "--block", w.block(), "--out", folder / "result"]
+
+
+@case("adjusted points added as control")
+def _(w: World) -> list[Any]:
+    catalogue = Catalogue.open(w.catalogue)
+    write(adjust(catalogue, w.block()), w.new)
+    return ["control", "add", w.fused, w.new / "points.parquet"]
 
 
 # --- imports ----------------------------------------------------------------------------------------------------------------------------

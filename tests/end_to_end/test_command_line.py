@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from networks import rewrite
 
 from orchestration.cli import main
+from submin.storage.catalogue import Catalogue
 
 
 class Shell:
@@ -151,3 +153,28 @@ def test_the_papers_experiments(shell: Shell, tmp_path: Path) -> None:
     made = shell.json("simulate", "worldview", "--out", tmp_path / "worldview", "--seed", 5)
     assert (made["images"], made["blocks"], made["points"], made["check_points"]) == (100, 49, 1347, 101)
     assert len(made["external_control"]) == 9
+
+
+def test_blocks_are_adjusted_and_readjusted(shell: Shell, place: Path, tmp_path: Path) -> None:
+    """A new block by a network of the others; then the cameras of all of it. Nothing goes into the network."""
+    source = Catalogue.open(place / "catalogue")
+    new, *others = list(source.blocks())
+    part, network = rewrite(source.path, tmp_path / "part", others), tmp_path / "network"
+    shell("create", network, "--fit", place / "catalogue", "--tile-km", 60, "--overlap-km", 20)
+    shell("run", part, network)
+
+    adjusted = shell.json("adjust", source.path, "--block", new.block_id, "--network", network, "--out", tmp_path / "adjusted")
+    assert (adjusted["block"], adjusted["images"], adjusted["status"]) == (new.block_id, 3, "controlled")
+    assert adjusted["control_points"] > 5 and adjusted["redundancy"] > 30
+    assert adjusted["variance_factor"] == pytest.approx(adjusted["chi_square"] / adjusted["redundancy"])
+    for key in ("points", "rejected_rays", "control_rejected", "images_flagged", "innovation", "check", "version", "policy", "tiles"):
+        assert key in adjusted
+    assert adjusted["check"]["points"] > 5
+    out, _ = shell("adjust", source.path, "--block", new.block_id, "--virtual-control", 3, "--out", tmp_path / "virtual")
+    assert "no accuracy is stated" in out
+
+    readjusted = shell.json("readjust", source.path, network, "--out", tmp_path / "cameras")
+    assert (readjusted["version"], readjusted["blocks"], readjusted["blocks_missing"]) == ("v1", len(others), [new.block_id])
+    assert shell.json("info", network)["version"] == "v1"
+    out, _ = shell("readjust", source.path, network, "--block", others[0].block_id, "--out", tmp_path / "one")
+    assert "3 images of 1 blocks" in out
