@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orchestration.batch import _network_images
+from orchestration.batch import network_images
 from submin.adjustment.adjustment import Adjustment, adjust
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
@@ -103,7 +103,7 @@ def triplet(request: pytest.FixtureRequest, data: Path, tmp_path_factory: pytest
     rays = sorted_rays(
         point.astype(np.int32), block.image, observed, np.full_like(observed, request.param), np.ones(len(observed), dtype=np.bool_)
     )  # fmt: skip
-    return Triplet(image_set(_network_images(block), WGS84, width_of(["rpc"])), rays, len(ids))
+    return Triplet(image_set(network_images(block), WGS84, width_of(["rpc"])), rays, len(ids))
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from submin.adjustment.rays import Rays, sorted_rays
 from submin.adjustment.virtual_control import VirtualControl, VirtuallyControlled, adjust_virtually, virtual_control, virtual_factor
 from submin.errors import InputError
 from submin.geodesy import geodetic_to_geocentric, local_axes
-from submin.simulation.region import SENSOR, RegionDesign, SimulatedRegion, image_priors, simulate_region
+from submin.simulation.region import SENSOR, RegionDesign, SimulatedRegion, simulate_region
 
 Array = NDArray[np.float64]
 DESIGN = RegionDesign(
@@ -55,8 +55,7 @@ class Case:
 @pytest.fixture(scope="module")
 def case() -> Case:
     region = simulate_region(DESIGN)
-    priors = tuple(image_priors(region.images, DESIGN.priors))
-    images = ImageSet(tuple(i.image_id for i in region.images), ("rpc",) * len(priors), region.packed_cameras(), priors, 6)
+    images = region.image_set()
     rays = sorted_rays(
         region.point, region.image, np.stack([region.sample, region.line], axis=1),
         np.stack([region.sigma_sample, region.sigma_line], axis=1), np.ones(len(region.image), dtype=np.bool_),
