@@ -55,7 +55,7 @@ class Case:
 @pytest.fixture(scope="module")
 def case() -> Case:
     region = simulate_region(DESIGN)
-    images = region.image_set()
+    images = region.image_set
     rays = sorted_rays(
         region.point, region.image, np.stack([region.sample, region.line], axis=1),
         np.stack([region.sigma_sample, region.sigma_line], axis=1), np.ones(len(region.image), dtype=np.bool_),
