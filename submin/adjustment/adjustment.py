@@ -64,6 +64,8 @@ HALVINGS = 10
 RUNAWAY = 4.0
 """Factor by which a point's weighted squares, and `SLACK` of them, may exceed what a step promised before the point runs away."""
 SLACK = 100.0
+CURVED = 1.01
+"""Factor by which they may exceed what a straight step would leave, or no step of the point at all: by more the step was not straight."""
 PROMISED = 1.1
 """Factor by which the weighted squares may exceed what a step promised, when they do not fall: points that are not determined, and the a
 priori model, have their part in what it does."""
@@ -136,7 +138,7 @@ class _State:
 
     @property
     def prior_squares(self) -> float:
-        return np.inf if self.whitened is None else float(self.whitened @ self.whitened)
+        return 0.0 if self.whitened is None else float(self.whitened @ self.whitened)
 
 
 @dataclass(frozen=True)
@@ -277,6 +279,8 @@ def _shortened(
     also whether the step was shortened.
     """
     theta, whitened = estimate.theta, estimate.whitened
+    # after a change of the a priori model its squares cannot be compared: then the rays alone must fit better
+    prior_weight = 0.0 if old.whitened is None else 1.0
     total = (1.0 + RISE) * (float(free @ old.squares) + old.prior_squares) + RISE
 
     def by_point(squares: Array) -> Array:
@@ -286,13 +290,15 @@ def _shortened(
     for halvings in range(HALVINGS + 1):
         new = _State.at(images, rays, theta, whitened, ground)
         after, left = by_point(new.squares), float(free @ new.squares)
-        away, falls = after > before + SLACK, left + new.prior_squares <= total
+        away, falls = after > before + SLACK, left + prior_weight * new.prior_squares <= total
         if away.any() or not falls:  # because of what the step has promised, or because the promise does not hold?
             promised, staying = (
                 np.fmin(np.square(residuals_of(old.linear, theta, shift)).sum(axis=1), UNSEEN)
                 for shift in (ground - old.ground, 0.0 * ground)
             )
-            away = after > np.minimum(RUNAWAY * (by_point(promised) + SLACK), by_point(staying) + SLACK)
+            # a point that is worse off than it would be had it stayed, and than it was promised
+            worse = np.maximum(by_point(promised), by_point(staying))
+            away = after > np.minimum(RUNAWAY * (by_point(promised) + SLACK), CURVED * worse + SLACK)
             falls = falls or left <= PROMISED * float(free @ promised) + RISE
         if falls and not away.any():
             return new, halvings > 0
