@@ -133,7 +133,7 @@ def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequen
         rows = np.concatenate([old, np.arange(first, first + len(new_images), dtype=np.int32)])
         images = image_set([*base.images(old), *new_images], base.metadata.ellipsoid, parameters)
         registration = register(rays, images, rows, cover)
-        full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(stored, cover, tile, out, registration)]
+        full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(stored, cover, parameters, tile, out, registration)]
         if not full:
             return Move(cover, parameters, out, registration, contradictions(rays, registration, images, rows, cover), tuple(new_images))
         for tile in full:
@@ -160,12 +160,12 @@ class Stored:
         return cls(base, frozenset(base.tile_numbers()), {base.cover.cell_name(c): c for c in base.cell_numbers()})
 
 
-def _overfull(stored: Stored, cover: Cover, tile: int, out: TakenOut, registration: Registration) -> bool:
+def _overfull(stored: Stored, cover: Cover, parameters: int, tile: int, out: TakenOut, registration: Registration) -> bool:
     """True when a tile would hold more image parameters than it may, and can be split."""
     if not cover.can_split(tile):
         return False
     base = stored.base
-    limit = base.metadata.max_parameters // base.metadata.parameters
+    limit = base.metadata.max_parameters // parameters
     arriving = {c: registration.arrivals[c].image for c in cover.cells_held(tile) if c in registration.arrivals}
     seen = [np.empty(0, dtype=np.int32), *arriving.values()]
     if tile in stored.tiles:

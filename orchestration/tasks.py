@@ -29,6 +29,8 @@ from submin.storage.network_store import Snapshot
 from submin.storage.schema import write_cell, write_sub_min
 from submin.tiling.cover import Cover
 
+LEAST_STATISTIC = 3.0
+"""An image found to be bad with less has lost most of its rays instead."""
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
@@ -281,11 +283,12 @@ def _flagged(result: Adjustment, images: ImageSet, rows: NDArray[np.int32]) -> t
         adjustable = np.flatnonzero(sigma > 0.0)
         worst = int(adjustable[np.argmax(np.abs(result.theta[k][adjustable]) / sigma[adjustable])])
         name, unit = parameters[worst].name, parameters[worst].unit
+        correction = f"{name} of the camera is {_rounded(result.theta[k, worst], sigma[worst])} {unit}"
+        found = result.image_statistic[k]
+        why = f"test statistic {found:.1f}" if found > LEAST_STATISTIC else "most of its rays contradict the camera as it was"
         flagged.append(FlaggedImage(
             int(rows[k]), images.ids[k],
-            f"{name} of the camera is {_rounded(result.theta[k, worst], sigma[worst])} {unit} where its a priori sigma is "
-            f"{sigma[worst]:g} {unit} "
-            f"(test statistic {result.image_statistic[k]:.1f}); its prior is no longer used",
+            f"{correction} where its a priori sigma is {sigma[worst]:g} {unit} ({why}); its prior is no longer used",
         ))  # fmt: skip
     return tuple(flagged)
 

@@ -82,7 +82,8 @@ class Adjustment:
     Attributes
     ----------
     theta : (m, p) corrections of the images
-    ground : (n, 3) geocentric positions, metres (a point that is not determined stays where it was)
+    ground : (n, 3) geocentric positions, metres: a point with fewer than two accepted rays is placed by all its rays, and one that these do
+        not determine stays where it was
     accepted : (r,) False for blunders
     statistic : (r,) test statistic of each ray when it was last judged
     released : (m,) True for images whose a priori model was released because their camera is bad
@@ -164,9 +165,8 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     if not np.isfinite(start).all():
         raise NumericalError(f"the positions of {int((~np.isfinite(start)).any(axis=1).sum())} of {len(start)} points are not finite")
     anchor = start if registered is None else registered
-    reach = _reach(images, rays, anchor)
-    # round-off of normal equations goes with the square of how much worse cameras are known than rays are measured
-    round_off = (reach.max(initial=REACH_METRES) / REACH_METRES) ** 2
+    reach = reach_metres(images, rays, anchor)
+    tolerance = round_off(reach)
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
     state = _State.at(images, rays, np.zeros((len(images), images.parameters)), np.zeros(images.prior.shape[1]), start)
@@ -180,7 +180,7 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
             break
 
     weight = (weight > 0.05).astype(np.float64)
-    released = np.zeros(len(images), dtype=bool)
+    released, adjustable = np.zeros(len(images), dtype=bool), (images.prior_variance > 0.0).any(axis=1)
     image_statistic, statistic = np.zeros(len(images)), np.zeros(len(rays))
     converged, judgements, last, before = False, 0, state, weight
     while not converged and judgements < MAX_ITERATIONS:
@@ -199,30 +199,45 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         restless = judgements % PATIENCE == 0 and np.count_nonzero(judged != weight) > RESTLESS * len(rays)
-        bad = (
-            (bad_cameras(worst, state.linear) | deserted_image(state.linear, judgeable, judged, released))
-            & ~released
-            & (decided or restless)
-        )
-        bad &= 2 * np.count_nonzero(released | bad) <= len(images)  # without most of their priors images could say anything
+        free = adjustable & ~released
+        bad = _to_release(worst, state.linear, judgeable, judged, free, int(adjustable.sum())) & (decided or restless)
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
-        rests = moved < round_off * CONVERGED_SIGMAS and _points_stand(last, state, weight, round_off)
+        rests = moved < tolerance * CONVERGED_SIGMAS and _points_stand(last, state, weight, tolerance)
         converged = decided and not bad.any() and (rests or (moved < NEAR_ENOUGH_SIGMAS and _linear(last, state, weight)))
         weight, released = judged, released | bad
         if bad.any():
             images, state = images.release(bad), replace(state, whitened=None)
 
     iteration += judgements
+    weight = np.where(state.seen, weight, 0.0)
     blind = unseen_image(state.linear, rays.accepted, state.seen)
+    adrift = _adrift(rays, weight, np.linalg.norm(state.ground - anchor, axis=1), reach)
     if blind is not None:
         status = Status(Cause.UNSEEN, converged, iteration, *blind)
+    elif adrift is not None:
+        status = Status(Cause.ADRIFT, False, iteration, point=adrift)
     elif converged:
         status = Status(Cause.CONVERGED, True, iteration)
     else:
         shift = state.theta - last.theta, state.ground - last.ground
-        status = diagnose(state.linear, weight, shift, weight != before, iteration, round_off * CONVERGED_SIGMAS)
+        status = diagnose(state.linear, weight, shift, weight != before, iteration, tolerance * CONVERGED_SIGMAS)
     final = residuals(state.linear, weight, state.theta)
     return Adjustment(state.theta, state.ground, weight > 0.0, statistic, released, image_statistic, final, status)
+
+
+def _to_release(
+    worst: Array, linear: LinearRays, tested: Array, judged: Array, free: NDArray[np.bool_], adjustable: int
+) -> NDArray[np.bool_]:
+    """Images (m,) whose prior is given up now, of those that have one (``free``): never more than half of all that can be adjusted.
+
+    Without most of their priors images could say anything.
+    """
+    suspected = np.where(free[:, None], worst, 0.0)
+    bad = (bad_cameras(suspected, linear) | deserted_image(linear, tested, judged, free)) & free
+    room = max(adjustable // 2 - (adjustable - int(free.sum())), 0)
+    least = np.argsort(np.where(bad, suspected.max(axis=1, initial=0.0), np.inf), kind="stable")
+    bad[least[: max(int(bad.sum()) - room, 0)]] = False
+    return bad
 
 
 def _linear(last: _State, state: _State, weight: Array) -> bool:
@@ -232,12 +247,12 @@ def _linear(last: _State, state: _State, weight: Array) -> bool:
     return bool(np.abs(promised - found)[weight > 0.0].max(initial=0.0) < CONVERGED_SIGMAS)
 
 
-def _points_stand(last: _State, state: _State, weight: Array, round_off: float) -> bool:
-    """True when a step has moved no point in any way that its rays would show; bounds grow with ``round_off``."""
+def _points_stand(last: _State, state: _State, weight: Array, tolerance: float) -> bool:
+    """True when a step has moved no point in any way that its rays would show; bounds grow with ``tolerance``."""
     shift = state.ground - last.ground
     return bool(
-        np.abs(shift).max(initial=0.0) < round_off * CONVERGED_METRES
-        or np.abs(moved_by_ground(state.linear, shift)[weight > 0.0]).max(initial=0.0) < round_off * CONVERGED_SIGMAS
+        np.abs(shift).max(initial=0.0) < tolerance * CONVERGED_METRES
+        or np.abs(moved_by_ground(state.linear, shift)[weight > 0.0]).max(initial=0.0) < tolerance * CONVERGED_SIGMAS
     )
 
 
@@ -259,6 +274,17 @@ def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, reach: 
     free = weight * (moves > 0.0) * (distance <= reach)[rays.point]
     reached, shortened = _shortened(images, rays, state, moves, free, estimate, anchor + offset)
     return _Step(reached, estimate, noise_bound(estimate.chi_square, sums.redundancy), shortened)
+
+
+def _adrift(rays: Rays, weight: Array, distance: Array, reach: Array) -> int | None:
+    """The first of the points that end where they are held back, when these are most, and cameras known to kilometres only; else None.
+
+    Cameras known to metres are linear as far as points may run along weak rays. Others are not: what a linearisation so far from the
+    solution says of its accuracy is not true.
+    """
+    used = np.bincount(rays.point[weight > 0.0], minlength=len(distance)) >= 2
+    held = used & (reach > REACH_METRES) & (distance > (1.0 - 1e-9) * reach)
+    return int(np.argmax(held)) if 2 * np.count_nonzero(held) > np.count_nonzero(used) else None
 
 
 def _placing(rays: Rays, weight: Array, seen: NDArray[np.bool_]) -> Array:
@@ -310,9 +336,14 @@ def _shortened(
     return (new if not ((moves > 0.0) & (new.squares >= UNSEEN)).any() else old), True
 
 
-def _reach(images: ImageSet, rays: Rays, anchor: Array) -> Array:
+def reach_metres(images: ImageSet, rays: Rays, anchor: Array) -> Array:
     """Metres (n,) from its anchor within which each point is linearised: `REACH_METRES`, or what its cameras explain."""
     projection = images.project(np.zeros((len(images), images.parameters)), images.ground(anchor), rays.image, rays.point)
     reach = np.full(len(anchor), REACH_METRES)
     np.maximum.at(reach, rays.point, explained_metres(projection, images.prior_variance[rays.image], rays.sigma))
     return reach
+
+
+def round_off(reach: Array) -> float:
+    """By how much round-off lets an adjustment move on: with the square of how much worse its cameras are known than usual."""
+    return float(reach.max(initial=REACH_METRES) / REACH_METRES) ** 2

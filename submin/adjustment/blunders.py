@@ -163,17 +163,17 @@ def bad_cameras(statistics: Array, linear: LinearRays) -> NDArray[np.bool_]:
     return bad
 
 
-def deserted_image(linear: LinearRays, tested: Array, judged: Array, released: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def deserted_image(linear: LinearRays, tested: Array, judged: Array, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The image (m,), one at most, that has lost most of its rays: not they are wrong, but its camera.
 
     Parameters
     ----------
-    tested, judged : (r,) above 0 for rays that were tested, and for those of them that passed; released : (m,) images left out of account
+    tested, judged : (r,) above 0 for rays that were tested, and for those of them that passed; free : (m,) images that can be meant
     """
-    every = np.bincount(linear.image, tested > 0.0, len(released))
-    lost = np.bincount(linear.image, (tested > 0.0) & ~(judged > 0.0), len(released))
-    part = np.where((every >= DESERTED_RAYS) & ~released, lost / np.maximum(every, 1.0), 0.0)
-    deserted = np.zeros(len(released), dtype=np.bool_)
+    every = np.bincount(linear.image, tested > 0.0, len(free))
+    lost = np.bincount(linear.image, (tested > 0.0) & ~(judged > 0.0), len(free))
+    part = np.where((every >= DESERTED_RAYS) & free, lost / np.maximum(every, 1.0), 0.0)
+    deserted = np.zeros(len(free), dtype=np.bool_)
     if part.max(initial=0.0) > 0.5:
         deserted[np.argmax(part)] = True
     return deserted

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.adjustment import CONVERGED_METRES, CONVERGED_SIGMAS, REACH_METRES
+from submin.adjustment.adjustment import CONVERGED_METRES, CONVERGED_SIGMAS, reach_metres, round_off
 from submin.adjustment.blunders import bad_cameras, image_statistics
 from submin.adjustment.control import ControlledEstimate, ControlledPrior, InnovationTest, estimate, innovation_test
 from submin.adjustment.elimination import LinearRays, linearise, moved_rays
+from submin.adjustment.explained import explained_metres
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays
 from submin.errors import NumericalError
@@ -23,7 +24,7 @@ MAX_ITERATIONS = 40
 MAX_DECISIONS = 200
 """Rounds of leaving out control and releasing cameras; every round decides at least one for good."""
 FAR_METRES = 1000.0
-"""Control that all of the block's rays to it pass by more than this, unadjusted, is of another place: no linearisation reaches so far."""
+"""Control that all of the block's rays to it pass by more than this, and than unadjusted cameras explain, is of another place."""
 COMPANY = 0.5
 """Control that contradicts the block half as much as the worst of it does is left out together with it."""
 
@@ -77,9 +78,9 @@ def adjust_controlled(images: ImageSet, rays: Rays, start: Array, prior_of: Call
     statistic, dof = np.where(active, 0.0, np.inf), np.zeros(len(active), dtype=np.int64)
     origin = start.copy()
     origin[prior.point] = prior.position
-    theta, ground, iterations = prior.theta, origin, 0
+    theta, ground, iterations, reach = prior.theta, origin, 0, reach_metres(images, rays, origin)
     for _ in range(MAX_DECISIONS):
-        linear, found, ground, steps = _converged(images, rays, weight, prior, active, origin, theta, ground)
+        linear, found, ground, steps = _converged(images, rays, weight, prior, active, origin, reach, theta, ground)
         theta, iterations = found.theta, iterations + steps
         statistic, dof = np.where(active, found.statistic, statistic), np.where(active, found.dof, dof)
         contradicting = found.outliers() & active
@@ -117,24 +118,36 @@ def _near(images: ImageSet, rays: Rays, prior: ControlledPrior, points: int) -> 
         closest = np.full(len(near), np.inf)
         np.minimum.at(closest, control[row], np.where(np.isfinite(passing), passing, np.inf))
         seen = np.bincount(control[row], minlength=len(near)) > 0
-        near = ~seen | (closest <= FAR_METRES)
+        variance = (prior.images**2).sum(axis=1).reshape(prior.theta.shape)
+        explained = np.zeros(len(near))
+        np.maximum.at(explained, control[row], explained_metres(projection, variance[rays.image[row]], rays.sigma[row]))
+        near = ~seen | (closest <= np.maximum(FAR_METRES, explained))
     return near
 
 
 def _converged(
-    images: ImageSet, rays: Rays, weight: Array, prior: ControlledPrior, active: Flags, origin: Array, theta: Array, ground: Array
+    images: ImageSet,
+    rays: Rays,
+    weight: Array,
+    prior: ControlledPrior,
+    active: Flags,
+    origin: Array,
+    reach: Array,
+    theta: Array,
+    ground: Array,
 ) -> tuple[LinearRays, ControlledEstimate, Array, int]:
     """Gauss-Newton: the last linearisation, the estimate there, where the points are linearised next, and the number of steps."""
+    still = round_off(reach)
     for step in range(1, MAX_ITERATIONS + 1):
         linear = linearise(images, rays, theta, ground, origin)
         found = estimate(linear, weight, prior, active, origin)
         offset = np.where(np.isfinite(found.ground), found.ground - origin, ground - origin)
         distance = np.linalg.norm(offset, axis=1)
-        offset *= np.minimum(1.0, REACH_METRES / np.maximum(distance, REACH_METRES))[:, None]
+        offset *= (reach / np.maximum(distance, reach))[:, None]
         shift = origin + offset - ground
         by_ground = np.einsum("rck,rk->rc", linear.by_ground, shift[rays.point])[weight > 0.0]
-        settled = np.abs(moved_rays(linear, found.theta - theta)).max(initial=0.0) < CONVERGED_SIGMAS and (
-            np.abs(shift).max(initial=0.0) < CONVERGED_METRES or np.abs(by_ground).max(initial=0.0) < CONVERGED_SIGMAS
+        settled = np.abs(moved_rays(linear, found.theta - theta)).max(initial=0.0) < still * CONVERGED_SIGMAS and (
+            np.abs(shift).max(initial=0.0) < still * CONVERGED_METRES or np.abs(by_ground).max(initial=0.0) < still * CONVERGED_SIGMAS
         )
         theta, ground = found.theta, origin + offset
         if settled:

@@ -46,6 +46,8 @@ def _steps(first: Offsets, image: Array, by_ground: Array, observed: Array, sigm
             for m in range(k + 1):
                 a[k, m] = hold[j, k] * hold[j, m]
         for i in range(first[j], first[j + 1]):
+            if not (np.isfinite(image[i, 0]) and np.isfinite(image[i, 1])):  # the camera does not see the point where it is now
+                continue
             for c in range(2):
                 weight = 1.0 / (sigma[i, c] * sigma[i, c])
                 residual = weight * (observed[i, c] - image[i, c])
@@ -70,13 +72,26 @@ def _steps(first: Offsets, image: Array, by_ground: Array, observed: Array, sigm
     return step
 
 
+def _cut(images: ImageSet, rays: Rays, first: Offsets) -> Array:
+    """Where the first ray of each point that reaches the ground meets its camera's mean height, geodetic (n, 3); NaN where none does."""
+    start = images.localise(rays.image[first[:-1]], rays.observed[first[:-1]])
+    lost = ~np.isfinite(start).all(axis=1)
+    if lost.any():
+        row = np.flatnonzero(lost[rays.point])
+        place = images.localise(rays.image[row], rays.observed[row])
+        reached = np.isfinite(place).all(axis=1)
+        point, at = np.unique(rays.point[row[reached]], return_index=True)
+        start[point] = place[reached][at]
+    return start
+
+
 def intersect(images: ImageSet, rays: Rays, points: int) -> Intersection:
     """Intersect the rays of each of ``points`` points; a single ray is cut at its camera's mean height.
 
     Every point must have at least one ray. Rays that were rejected count too: registration comes before any judgement.
     """
     first = rays.first(points)
-    start = images.localise(rays.image[first[:-1]], rays.observed[first[:-1]])
+    start = _cut(images, rays, first)
     ground = geodetic_to_geocentric(start, images.ellipsoid)
     reached = np.isfinite(ground).all(axis=1)
     ground[~reached] = ground[reached][0] if reached.any() else np.array([images.ellipsoid.semimajor_axis, 0.0, 0.0])

@@ -76,7 +76,7 @@ class Uncertainty:
     def correlations(self, seconds: Array) -> Array:
         """Correlation matrix (n, n) of the own parts of n images taken at these times (n,), in seconds; NaN where unknown."""
         n = len(seconds)
-        if self.correlation == "none":
+        if self.correlation == "none" or n == 1:
             return np.eye(n)
         if self.correlation == "fixed":
             return np.full((n, n), self.correlation_parameter) + (1.0 - self.correlation_parameter) * np.eye(n)

@@ -83,7 +83,7 @@ def explain(variance: Array, residual: Array, n: int, critical: float, doubt: fl
     """
     blunder[:n] = False
     work, left = np.empty((2 * n, 2 * n)), np.empty(2 * n)
-    rays, drops = np.empty(n, np.int64), np.empty(MOST_EXPLANATIONS)
+    rays, drops = np.empty(n, np.int64), np.empty(max(n, MOST_EXPLANATIONS))
     for size in range(1, n):
         tries = _choices(n, size)
         greedy = tries > MOST_EXPLANATIONS

@@ -26,6 +26,7 @@ class Cause(Enum):
     FEW_AGREE = "most rays contradict each other"
     DECISIONS = "rays are rejected and taken back in turn"
     SINGULAR = "points are seen from one direction only"
+    ADRIFT = "most points run away along their rays"
     CAMERA = "a camera moves on and on"
     POINT = "a point moves on and on"
 
@@ -75,6 +76,11 @@ class Status:
                 return (
                     f"{steps}: point {point} is seen from one direction only (its rays meet at {self.amount:.2g} degrees); "
                     "add an image from another direction, or heights of the points"
+                )
+            case Cause.ADRIFT:
+                return (
+                    f"most points, {point} among them, run away along their rays, farther than the cameras can be linearised; "
+                    "add images from other directions, control, or smaller a priori sigmas"
                 )
             case Cause.CAMERA:
                 return (

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from submin.adjustment.adjustment import CONVERGED_METRES, CONVERGED_SIGMAS, REACH_METRES
+from submin.adjustment.adjustment import CONVERGED_METRES, CONVERGED_SIGMAS, reach_metres
 from submin.adjustment.elimination import eliminate, ground_corrections, linearise, moved_rays, point_factors
 from submin.adjustment.estimation import estimate_images
 from submin.adjustment.images import ImageSet
@@ -161,7 +161,7 @@ def adjust_virtually(images: ImageSet, rays: Rays, start: Array, control: Virtua
         When it does not converge.
     """
     factor, weight, m, p = virtual_factor(images, control), rays.accepted.astype(np.float64), len(images), images.parameters
-    theta, ground = np.zeros((m, p)), start
+    theta, ground, reach = np.zeros((m, p)), start, reach_metres(images, rays, start)
     for iteration in range(1, MAX_ITERATIONS + 1):
         linear = linearise(images, rays, theta, ground, start)
         sums = eliminate(linear, weight, m)
@@ -169,7 +169,7 @@ def adjust_virtually(images: ImageSet, rays: Rays, start: Array, control: Virtua
         factors = point_factors(linear, weight)
         offset = ground_corrections(factors, linear, found.theta)
         distance = np.linalg.norm(offset, axis=1)
-        offset *= np.minimum(1.0, REACH_METRES / np.maximum(distance, REACH_METRES))[:, None]
+        offset *= (reach / np.maximum(distance, reach))[:, None]
         moved = np.abs(moved_rays(linear, found.theta - theta)).max(initial=0.0)
         shift = np.abs(start + offset - ground).max(initial=0.0)
         theta, ground = found.theta, start + offset

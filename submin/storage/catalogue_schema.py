@@ -325,11 +325,11 @@ def defects(block: Block) -> str | None:
     if block.a_priori is not None and len(block) < LEAST_RAYS:
         found = f"{len(block)} ray{'s' * (len(block) > 1)}"
         return f"the block has {found}; expected at least {LEAST_RAYS}: measure more, or join it to another block"
-    if block.a_priori is not None and block.a_priori.correlation in ("exponential", "gaussian"):
-        for image in block.images:
-            if not image.acquired:
-                model = block.a_priori.correlation
-                return f"image {image.image_id} has no time; the {model} correlation of the priors needs column 'acquired'"
+    for image in block.images:
+        models = () if block.a_priori is None or image.acquired else map(block.a_priori.of, sensor_named(image.sensor).parameters)
+        for model in models:
+            if model.sigma > 0.0 and model.correlation in ("exponential", "gaussian"):
+                return f"image {image.image_id} has no time; the {model.correlation} correlation of the priors needs column 'acquired'"
     return None
 
 
