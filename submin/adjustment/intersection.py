@@ -75,7 +75,7 @@ def _steps(first: Offsets, image: Array, by_ground: Array, observed: Array, sigm
 def _cut(images: ImageSet, rays: Rays, first: Offsets) -> Array:
     """Where the first ray of each point that reaches the ground meets its camera's mean height, geodetic (n, 3); NaN where none does."""
     start = images.localise(rays.image[first[:-1]], rays.observed[first[:-1]])
-    lost = ~np.isfinite(start).all(axis=1)
+    lost = np.asarray(~np.isfinite(start).all(axis=1))
     if lost.any():
         row = np.flatnonzero(lost[rays.point])
         place = images.localise(rays.image[row], rays.observed[row])
