@@ -40,8 +40,8 @@ from submin.errors import NumericalError
 Array = NDArray[np.float64]
 
 ROBUST_ITERATIONS = 6
-SETTLED_WEIGHT = 0.02
-"""Robust weights that change less have done their work."""
+SETTLED_WEIGHT = 0.1
+"""Robust weights that change less have done their work: they only have to find the neighbourhood in which rays are judged."""
 MAX_ITERATIONS = 40
 FREE_DECISIONS = 12
 """Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
@@ -165,11 +165,11 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     if not np.isfinite(start).all():
         raise NumericalError(f"the positions of {int((~np.isfinite(start)).any(axis=1).sum())} of {len(start)} points are not finite")
     anchor = start if registered is None else registered
-    reach = reach_metres(images, rays, anchor)
-    tolerance = round_off(reach)
     candidates = rays.accepted.astype(np.float64)
     weight = candidates.copy()
     state = _State.at(images, rays, np.zeros((len(images), images.parameters)), np.zeros(images.prior.shape[1]), start)
+    reach = reach_metres(images, rays, state.linear)
+    tolerance = round_off(reach)
     iteration, robust = 0, 0
     while robust < ROBUST_ITERATIONS and iteration < MAX_ITERATIONS:
         iteration += 1
@@ -182,7 +182,7 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     weight = (weight > 0.05).astype(np.float64)
     released, adjustable = np.zeros(len(images), dtype=bool), (images.prior_variance > 0.0).any(axis=1)
     image_statistic, statistic = np.zeros(len(images)), np.zeros(len(rays))
-    converged, judgements, last, before = False, 0, state, weight
+    converged, judgements, last, before, judged, sure = False, 0, state, weight, weight, False
     while not converged and judgements < MAX_ITERATIONS:
         judgements += 1
         step = _advance(images, rays, state, anchor, reach, weight)
@@ -193,8 +193,9 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         moved = np.abs(moved_rays(state.linear, theta - last.theta)[state.seen]).max(initial=0.0)
         # while images move, what contradicts a point may be their doing: then only the likeliest blunder goes, with no doubt about it
         judgeable = np.where(state.seen, candidates if judgements <= FREE_DECISIONS else weight, 0.0)
-        doubt = step.noise if moved < NEAR_SIGMAS else 0.0
-        judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, doubt, weight)
+        if not (sure and moved < NEAR_ENOUGH_SIGMAS and _farthest(last, state, weight) < NEAR_ENOUGH_SIGMAS):
+            doubt = step.noise if moved < NEAR_SIGMAS else 0.0
+            judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, doubt, weight)
         worst = image_statistics(theta, covariance, images.prior_variance)
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
@@ -205,6 +206,9 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         rests = moved < tolerance * CONVERGED_SIGMAS and _points_stand(last, state, weight, tolerance)
         converged = decided and not bad.any() and (rests or (moved < NEAR_ENOUGH_SIGMAS and _linear(last, state, weight)))
         weight, released = judged, released | bad
+        sure = (
+            decided and not bad.any() and moved < NEAR_SIGMAS
+        )  # what was decided here will not be decided otherwise a hundredth of a sigma on
         if bad.any():
             images, state = images.release(bad), replace(state, whitened=None)
 
@@ -249,11 +253,13 @@ def _linear(last: _State, state: _State, weight: Array) -> bool:
 
 def _points_stand(last: _State, state: _State, weight: Array, tolerance: float) -> bool:
     """True when a step has moved no point in any way that its rays would show; bounds grow with ``tolerance``."""
-    shift = state.ground - last.ground
-    return bool(
-        np.abs(shift).max(initial=0.0) < tolerance * CONVERGED_METRES
-        or np.abs(moved_by_ground(state.linear, shift)[weight > 0.0]).max(initial=0.0) < tolerance * CONVERGED_SIGMAS
-    )
+    shift = np.abs(state.ground - last.ground).max(initial=0.0)
+    return bool(shift < tolerance * CONVERGED_METRES or _farthest(last, state, weight) < tolerance * CONVERGED_SIGMAS)
+
+
+def _farthest(last: _State, state: _State, weight: Array) -> float:
+    """The farthest that points' moves have moved an accepted ray, in sigmas."""
+    return float(np.abs(moved_by_ground(state.linear, state.ground - last.ground)[weight > 0.0]).max(initial=0.0))
 
 
 def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, reach: Array, weight: Array) -> _Step:
@@ -336,11 +342,13 @@ def _shortened(
     return (new if not ((moves > 0.0) & (new.squares >= UNSEEN)).any() else old), True
 
 
-def reach_metres(images: ImageSet, rays: Rays, anchor: Array) -> Array:
-    """Metres (n,) from its anchor within which each point is linearised: `REACH_METRES`, or what its cameras explain."""
-    projection = images.project(np.zeros((len(images), images.parameters)), images.ground(anchor), rays.image, rays.point)
-    reach = np.full(len(anchor), REACH_METRES)
-    np.maximum.at(reach, rays.point, explained_metres(projection, images.prior_variance[rays.image], rays.sigma))
+def reach_metres(images: ImageSet, rays: Rays, linear: LinearRays) -> Array:
+    """Metres (n,) within which each point is linearised, of where it was registered: `REACH_METRES`, or what its cameras explain.
+
+    ``linear`` are the rays linearised at unadjusted cameras.
+    """
+    reach = np.full(len(linear.first) - 1, REACH_METRES)
+    np.maximum.at(reach, rays.point, explained_metres(linear.by_ground, linear.by_parameters, images.prior_variance[rays.image]))
     return reach
 
 

@@ -78,7 +78,12 @@ def adjust_controlled(images: ImageSet, rays: Rays, start: Array, prior_of: Call
     statistic, dof = np.where(active, 0.0, np.inf), np.zeros(len(active), dtype=np.int64)
     origin = start.copy()
     origin[prior.point] = prior.position
-    theta, ground, iterations, reach = prior.theta, origin, 0, reach_metres(images, rays, origin)
+    theta, ground, iterations, reach = (
+        prior.theta,
+        origin,
+        0,
+        reach_metres(images, rays, linearise(images, rays, prior.theta, origin, origin)),
+    )
     for _ in range(MAX_DECISIONS):
         linear, found, ground, steps = _converged(images, rays, weight, prior, active, origin, reach, theta, ground)
         theta, iterations = found.theta, iterations + steps
@@ -120,7 +125,8 @@ def _near(images: ImageSet, rays: Rays, prior: ControlledPrior, points: int) -> 
         seen = np.bincount(control[row], minlength=len(near)) > 0
         variance = (prior.images**2).sum(axis=1).reshape(prior.theta.shape)
         explained = np.zeros(len(near))
-        np.maximum.at(explained, control[row], explained_metres(projection, variance[rays.image[row]], rays.sigma[row]))
+        by_ground, by_parameters = (part / rays.sigma[row][:, :, None] for part in (projection.by_ground, projection.by_parameters))
+        np.maximum.at(explained, control[row], explained_metres(by_ground, by_parameters, variance[rays.image[row]]))
         near = ~seen | (closest <= np.maximum(FAR_METRES, explained))
     return near
 

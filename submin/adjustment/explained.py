@@ -9,24 +9,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.sensors import Projection
-
 Array = NDArray[np.float64]
 
 EXPLAINED_SIGMAS = 4.0
 """What is so many a priori sigmas off has another reason."""
 
 
-def explained_metres(projection: Projection, prior_variance: Array, sigma: Array) -> Array:
+def explained_metres(by_ground: Array, by_parameters: Array, prior_variance: Array) -> Array:
     """Metres (r,) on the ground, across each ray, that are `EXPLAINED_SIGMAS` of its camera and measurement; 0 for a ray without ground.
 
     Parameters
     ----------
-    projection : of the rays, unadjusted cameras
+    by_ground, by_parameters : (r, 2, 3), (r, 2, p), partials of the rays at unadjusted cameras, in sigmas of the measurements
     prior_variance : (r, p), a priori, of the parameters of each ray's image
-    sigma : (r, 2), of the measurements
     """
-    in_image = np.einsum("rcp,rp->r", projection.by_parameters**2, prior_variance) + (sigma**2).sum(axis=1)
-    by_metre = 0.5 * (projection.by_ground**2).sum(axis=(1, 2))
-    square = np.divide(in_image, by_metre, out=np.zeros_like(in_image), where=by_metre > 0.0)
+    in_sigmas = np.einsum("rcp,rcp,rp->r", by_parameters, by_parameters, prior_variance) + 2.0
+    by_metre = 0.5 * np.einsum("rck,rck->r", by_ground, by_ground)
+    square = np.divide(in_sigmas, by_metre, out=np.zeros_like(in_sigmas), where=by_metre > 0.0)
     return np.asarray(EXPLAINED_SIGMAS * np.sqrt(square))

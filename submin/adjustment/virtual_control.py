@@ -161,9 +161,10 @@ def adjust_virtually(images: ImageSet, rays: Rays, start: Array, control: Virtua
         When it does not converge.
     """
     factor, weight, m, p = virtual_factor(images, control), rays.accepted.astype(np.float64), len(images), images.parameters
-    theta, ground, reach = np.zeros((m, p)), start, reach_metres(images, rays, start)
+    theta, ground, reach = np.zeros((m, p)), start, np.empty(0)
     for iteration in range(1, MAX_ITERATIONS + 1):
         linear = linearise(images, rays, theta, ground, start)
+        reach = reach_metres(images, rays, linear) if iteration == 1 else reach
         sums = eliminate(linear, weight, m)
         found = estimate_images(sums, factor, p)
         factors = point_factors(linear, weight)

@@ -186,7 +186,8 @@ def _explained(images: ImageSet, image: NDArray[np.int32], rays: LooseRays) -> A
     seen, every = image[reached], np.arange(int(reached.sum()), dtype=np.int32)
     projection = images.project(np.zeros((len(images), images.parameters)), images.ground(place[reached]), seen, every)
     explained = np.zeros(len(image))
-    explained[reached] = explained_metres(projection, images.prior_variance[seen], rays.sigma[reached])
+    by_ground, by_parameters = (part / rays.sigma[reached][:, :, None] for part in (projection.by_ground, projection.by_parameters))
+    explained[reached] = explained_metres(by_ground, by_parameters, images.prior_variance[seen])
     return explained
 
 

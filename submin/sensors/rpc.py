@@ -46,53 +46,55 @@ LOCALISED_PIXELS = 1e-6
 """Far below any measurement, and far above the spacing of longitudes in float64 (a few 1e-9 pixels)."""
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _ratio(num: Array, den: Array, lon: float, lat: float, h: float, out: Array) -> None:
-    """Value and partials (4,) of num/den with respect to normalised longitude, latitude, height."""
-    for k, c in enumerate((num, den)):
-        value = (
-            c[0] + lon * (c[1] + lat * (c[4] + h * c[10]) + h * c[5] + lon * (c[7] + lon * c[11] + lat * c[14] + h * c[17]))
-            + lat * (c[2] + h * c[6] + lat * (c[8] + lon * c[12] + lat * c[15] + h * c[18]) + h * h * c[16])
-            + h * (c[3] + h * (c[9] + lon * c[13] + h * c[19]))
-        )  # fmt: skip
-        by_lon = (
-            c[1] + lat * (c[4] + h * c[10] + lat * c[12]) + h * (c[5] + h * c[13])
-            + lon * (2.0 * (c[7] + lat * c[14] + h * c[17]) + 3.0 * lon * c[11])
-        )  # fmt: skip
-        by_lat = (
-            c[2] + lon * (c[4] + h * c[10] + lon * c[14]) + h * (c[6] + h * c[16])
-            + lat * (2.0 * (c[8] + lon * c[12] + h * c[18]) + 3.0 * lat * c[15])
-        )  # fmt: skip
-        by_h = (
-            c[3] + lon * (c[5] + lat * c[10] + lon * c[17]) + lat * (c[6] + lat * c[18])
-            + h * (2.0 * (c[9] + lon * c[13] + lat * c[16]) + 3.0 * h * c[19])
-        )  # fmt: skip
-        if k == 0:
-            out[0], out[1], out[2], out[3] = value, by_lon, by_lat, by_h
-        else:
-            ratio = out[0] / value
-            out[0] = ratio
-            out[1] = (out[1] - ratio * by_lon) / value
-            out[2] = (out[2] - ratio * by_lat) / value
-            out[3] = (out[3] - ratio * by_h) / value
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _raw(camera: Array, geodetic: Array, terms: Array, sums: Array, sample: Array, line: Array) -> None:
+    """Unadjusted sample and line and their partials by longitude, latitude (per degree) and height (per metre): two rows of 4.
 
-
-@numba.njit(cache=True, error_model="numpy")
-def _raw(camera: Array, geodetic: Array, sample: Array, line: Array) -> None:
-    """Unadjusted sample and line and their partials by longitude, latitude (per degree) and height (per metre): two rows of 4."""
+    ``terms`` (4, 20) and ``sums`` (4, 4) are work space: the terms of a cubic polynomial and their partials, and what they come to in each
+    of the four polynomials. These are worked on side by side, their sums in registers: one instruction takes all four.
+    """
     dlon = geodetic[0] - camera[_LON_OFF]
     dlon -= 360.0 * np.floor((dlon + 180.0) / 360.0)
     lon = dlon / camera[_LON_SC]
     lat = (geodetic[1] - camera[_LAT_OFF]) / camera[_LAT_SC]
     h = (geodetic[2] - camera[_H_OFF]) / camera[_H_SC]
-    c = _COEFFICIENTS
-    _ratio(camera[c : c + 20], camera[c + 20 : c + 40], lon, lat, h, line)
-    _ratio(camera[c + 40 : c + 60], camera[c + 60 : c + 80], lon, lat, h, sample)
-    for out, offset, scale in ((line, camera[_LINE_OFF], camera[_LINE_SC]), (sample, camera[_SAMP_OFF], camera[_SAMP_SC])):
-        out[0] = offset + scale * out[0]
-        out[1] *= scale / camera[_LON_SC]
-        out[2] *= scale / camera[_LAT_SC]
-        out[3] *= scale / camera[_H_SC]
+    _terms(lon, lat, h, terms)
+    v0 = v1 = v2 = v3 = x0 = x1 = x2 = x3 = y0 = y1 = y2 = y3 = z0 = z1 = z2 = z3 = 0.0
+    for t in range(TERMS):
+        c = _COEFFICIENTS + 4 * t
+        c0, c1, c2, c3 = camera[c], camera[c + 1], camera[c + 2], camera[c + 3]
+        v, x, y, z = terms[0, t], terms[1, t], terms[2, t], terms[3, t]
+        v0, v1, v2, v3 = v0 + v * c0, v1 + v * c1, v2 + v * c2, v3 + v * c3
+        x0, x1, x2, x3 = x0 + x * c0, x1 + x * c1, x2 + x * c2, x3 + x * c3
+        y0, y1, y2, y3 = y0 + y * c0, y1 + y * c1, y2 + y * c2, y3 + y * c3
+        z0, z1, z2, z3 = z0 + z * c0, z1 + z * c1, z2 + z * c2, z3 + z * c3
+    sums[0, 0], sums[0, 1], sums[0, 2], sums[0, 3] = v0, v1, v2, v3
+    sums[1, 0], sums[1, 1], sums[1, 2], sums[1, 3] = x0, x1, x2, x3
+    sums[2, 0], sums[2, 1], sums[2, 2], sums[2, 3] = y0, y1, y2, y3
+    sums[3, 0], sums[3, 1], sums[3, 2], sums[3, 3] = z0, z1, z2, z3
+    for out, offset, scale, k in ((line, camera[_LINE_OFF], camera[_LINE_SC], 0), (sample, camera[_SAMP_OFF], camera[_SAMP_SC], 2)):
+        part = scale / sums[0, k + 1]
+        ratio = sums[0, k] / sums[0, k + 1]
+        out[0] = offset + scale * ratio
+        out[1] = (sums[1, k] - ratio * sums[1, k + 1]) * part / camera[_LON_SC]
+        out[2] = (sums[2, k] - ratio * sums[2, k + 1]) * part / camera[_LAT_SC]
+        out[3] = (sums[3, k] - ratio * sums[3, k + 1]) * part / camera[_H_SC]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _terms(lon: float, lat: float, h: float, t: Array) -> None:
+    """Terms of a cubic polynomial in RPC00B order, and their partials by longitude, latitude and height (4, 20); zeros stay zero."""
+    ll, pp, hh = lon * lon, lat * lat, h * h
+    t[0, 0], t[0, 1], t[0, 2], t[0, 3], t[0, 4] = 1.0, lon, lat, h, lon * lat
+    t[0, 5], t[0, 6], t[0, 7], t[0, 8], t[0, 9] = lon * h, lat * h, ll, pp, hh
+    t[0, 10], t[0, 11], t[0, 12], t[0, 13], t[0, 14] = lon * lat * h, ll * lon, lon * pp, lon * hh, ll * lat
+    t[0, 15], t[0, 16], t[0, 17], t[0, 18], t[0, 19] = pp * lat, lat * hh, ll * h, pp * h, hh * h
+    t[1, 1], t[1, 4], t[1, 5], t[1, 7], t[1, 10] = 1.0, lat, h, 2.0 * lon, lat * h
+    t[1, 11], t[1, 12], t[1, 13], t[1, 14], t[1, 17] = 3.0 * ll, pp, hh, 2.0 * lon * lat, 2.0 * lon * h
+    t[2, 2], t[2, 4], t[2, 6], t[2, 8], t[2, 10] = 1.0, lon, h, 2.0 * lat, lon * h
+    t[2, 12], t[2, 14], t[2, 15], t[2, 16], t[2, 18] = 2.0 * lon * lat, ll, 3.0 * pp, hh, 2.0 * lat * h
+    t[3, 3], t[3, 5], t[3, 6], t[3, 9], t[3, 10] = 1.0, lon, lat, 2.0 * h, lon * lat
+    t[3, 13], t[3, 16], t[3, 17], t[3, 18], t[3, 19] = 2.0 * lon * h, 2.0 * lat * h, ll, pp, 3.0 * hh
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -103,10 +105,10 @@ def _project(
     predicted = np.empty((rays, 2))
     by_ground = np.empty((rays, 2, 3))
     by_parameters = np.zeros((rays, 2, 6))
-    sample, line = np.empty(4), np.empty(4)
+    sample, line, terms, sums = np.empty(4), np.empty(4), np.zeros((4, TERMS)), np.empty((4, 4))
     for r in range(rays):
         camera, theta, j = cameras[image[r]], parameters[image[r]], point[r]
-        _raw(camera, geodetic[j], sample, line)
+        _raw(camera, geodetic[j], terms, sums, sample, line)
         fixed = len(at) > 0
         s = ((at[r, 0] if fixed else sample[0]) - camera[_CENTRE_SAMPLE]) / camera[_HALF_WIDTH]
         t = ((at[r, 1] if fixed else line[0]) - camera[_CENTRE_LINE]) / camera[_HALF_HEIGHT]
@@ -130,13 +132,13 @@ def _project(
 @numba.njit(cache=True, error_model="numpy")
 def _localise(cameras: Array, image: Index, samples: Array, lines: Array, heights: Array) -> Array:
     ground = np.empty((len(image), 3))
-    sample, line = np.empty(4), np.empty(4)
+    sample, line, terms, sums = np.empty(4), np.empty(4), np.zeros((4, TERMS)), np.empty((4, 4))
     for r in range(len(image)):
         camera, g = cameras[image[r]], ground[r]
         g[0], g[1], g[2] = camera[_LON_OFF], camera[_LAT_OFF], heights[r]
         converged = False
         for _ in range(30):
-            _raw(camera, g, sample, line)
+            _raw(camera, g, terms, sums, sample, line)
             es, el = samples[r] - sample[0], lines[r] - line[0]
             if abs(es) < LOCALISED_PIXELS and abs(el) < LOCALISED_PIXELS:
                 converged = True
@@ -184,8 +186,7 @@ class RpcSensor:
                 + ("; they look swapped" if abs(longitude) <= 90.0 and abs(latitude) <= 360.0 else "")
             )
         for k, name in enumerate(POLYNOMIALS):
-            start = _COEFFICIENTS + TERMS * k
-            packed[start : start + TERMS] = _coefficients(camera, name)
+            packed[_COEFFICIENTS + k : _COEFFICIENTS + 4 * TERMS : 4] = _coefficients(camera, name)  # term by term, four at a time
         if not (width > 0 and height > 0 and np.isfinite([width, height]).all()):
             raise InputError(f"RPC: image size is {width} x {height}; expected positive numbers of pixels")
         origin = _origin(camera)

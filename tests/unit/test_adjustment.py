@@ -371,17 +371,20 @@ def test_points_may_move_as_far_as_their_cameras_explain() -> None:
     assert np.linalg.norm(result.ground - block.ground, axis=1).max() < 4.0 * 10_000.0
 
 
+def whitened(block: FrameBlock) -> tuple[Array, Array]:
+    """Partials of the rays at unadjusted cameras, in sigmas."""
+    linear = linearise(block.images, block.rays, np.zeros((4, 7)), block.ground, block.ground)
+    return linear.by_ground, linear.by_parameters
+
+
 def test_what_cameras_explain_is_their_a_priori_sigma_on_the_ground() -> None:
     block = frame_block(0.0, 0.0, position=0.0, attitude=0.01, **{"focal length": 0.0})
-    projection = block.images.project(
-        np.zeros((4, 7)), block.images.ground(block.ground), block.rays.image, block.rays.point
-    )  # fmt: skip
-    explained = explained_metres(projection, block.images.prior_variance[block.rays.image], block.rays.sigma)
+    explained = explained_metres(*whitened(block), block.images.prior_variance[block.rays.image])
     distance = np.linalg.norm(block.ground[block.rays.point] - block.images.cameras[block.rays.image, :3], axis=1)
     # two angles across the line of sight; the image is stretched away from its middle, where rays are
     np.testing.assert_allclose(explained, EXPLAINED_SIGMAS * np.sqrt(2.0) * 0.01 * distance, rtol=0.1)
     held = frame_block(0.0, 0.0, position=0.0, attitude=0.0, **{"focal length": 0.0})
-    by_measurement = explained_metres(projection, held.images.prior_variance[held.rays.image], held.rays.sigma)
+    by_measurement = explained_metres(*whitened(held), held.images.prior_variance[held.rays.image])
     np.testing.assert_allclose(by_measurement, EXPLAINED_SIGMAS * np.sqrt(2.0) * SIGMA_PX * distance / 10_000.0, rtol=0.1)
 
 
@@ -446,7 +449,7 @@ def test_point_that_its_camera_does_not_reach_is_nan_and_the_others_are_not() ->
     block = simulate(16, theta=np.zeros((3, P)))
     broken = block.images.cameras.copy()
     # sample = L - L^2 turns back
-    broken[0, 10 + 40 + 1], broken[0, 10 + 40 + 7] = 1.0, -1.0
+    broken[0, 10 + 4 * 1 + 2], broken[0, 10 + 4 * 7 + 2] = 1.0, -1.0
     images = replace(block.images, cameras=broken)
     point, image = np.arange(3, dtype=np.int32), np.array([1, 0, 2], dtype=np.int32)
     observed = np.array([[5000.0, 5000.0], [4999.5 + 4000.0, 5000.0], [5000.0, 5000.0]])

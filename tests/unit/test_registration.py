@@ -653,7 +653,7 @@ def test_a_single_ray_is_not_apart_from_itself_wherever_it_lies() -> None:
 def unreachable() -> ImageSet:
     """The images, but the second turns back at 2,500 pixels from its middle: nothing on the ground is seen at sample 9,500."""
     images = replace(IMAGES, cameras=IMAGES.cameras.copy())
-    images.cameras[1, 10 + 40 + 7] = -images.cameras[1, 10 + 40 + 1]
+    images.cameras[1, 10 + 4 * 7 + 2] = -images.cameras[1, 10 + 4 * 1 + 2]
     return images
 
 
