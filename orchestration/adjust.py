@@ -29,12 +29,13 @@ from submin.query.block_control import control_of_block
 from submin.query.control_set import ControlSet
 from submin.query.planner import DETERMINED_METRES
 from submin.sensors import width_of
-from submin.storage.adjusted import NO_COVARIANCE, RULE_0, AdjustedCameras, AdjustedWriter, refuse_derived
+from submin.storage.adjusted import NO_COVARIANCE, AdjustedCameras, AdjustedWriter
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, CatalogueMetadata, PointTable, defects
 from submin.storage.ledger import Ledger
 from submin.storage.network import Network
 from submin.storage.network_store import Snapshot
+from submin.storage.point_table import RULE_0
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -223,7 +224,6 @@ def _control(
     table = catalogue.points("control")
     if table is None:
         return (lambda images: uncontrolled(images.prior, p)), _Source("none")
-    refuse_derived(catalogue.path / "control.parquet")
     _, point, row = np.intersect1d(judged.ids, table.point_ids, return_indices=True)
     position = geodetic_to_geocentric(table.geodetic[row], catalogue.metadata.ellipsoid)
     if table.joint_covariance is not None:

@@ -309,10 +309,8 @@ def control_add(
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
     from orchestration.stopping import resumable
-    from submin.storage.adjusted import refuse_derived
     from submin.storage.point_table import read_point_table
 
-    refuse_derived(points)
     table = read_point_table(points, "definite")
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         added = add_control(table, str(points), network, executor, reporter)

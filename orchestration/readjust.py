@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from orchestration.run import check_frames
 from submin.errors import InputError
 from submin.query.readjustment import Readjusted, coupled_images, readjust
-from submin.storage.adjusted import RULE_0, AdjustedCameras, AdjustedWriter
+from submin.storage.adjusted import AdjustedCameras, AdjustedWriter
 from submin.storage.arrays import group_of, read_record
 from submin.storage.catalogue import Catalogue
 from submin.storage.control_blocks import control_point_of
 from submin.storage.ledger import Ledger
 from submin.storage.network import Network
+from submin.storage.point_table import RULE_0
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from orchestration.tasks import FlaggedImage
 from submin.errors import InputError
-from submin.storage.adjusted import refuse_derived
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, control_point_of
@@ -107,7 +106,6 @@ def run(
     started, reporter = time.monotonic(), reporter or Silent()
     check_frames(catalogue, Snapshot.open(place))
     summary = catalogue.validate()
-    refuse_derived(catalogue.path / "control.parquet")
     control = catalogue.points("control")
     reporter.begin(summary.blocks + (0 if control is None else len(control)))
     every = chain(

@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 
 SUFFIXES = (".parquet", ".csv", ".csv.gz")
 BATCH_ROWS = 1 << 16
-_CSV_BLOCK_BYTES = 1 << 24
+_CSV_READING = pcsv.ReadOptions(use_threads=False, block_size=1 << 24)
+_CSV_PARSING = pcsv.ParseOptions(newlines_in_values=True)
 _BROKEN_CSV_ROW = re.compile(r"Row #(\d+): (Expected .*)")
 _NOT_UTF8 = re.compile(r"Row #(\d+): .*invalid UTF8")
 
@@ -93,6 +94,17 @@ def table_batches(path: Path, columns: Collection[Column]) -> Iterator[tuple[int
         raise CatalogueError(f"{path}: cannot be read as a table ({reason.rstrip('.')}); write or copy it again") from None
 
 
+def column_names(path: Path) -> tuple[str, ...]:
+    """All columns that a Parquet or CSV file has; none when it cannot be read: whoever reads it says what is wrong with it."""
+    try:
+        if path.suffix == ".parquet":
+            return tuple(pq.read_schema(path).names)
+        with pcsv.open_csv(path, read_options=_CSV_READING, parse_options=_CSV_PARSING) as header:
+            return tuple(header.schema.names)
+    except (pa.ArrowException, OSError):
+        return ()
+
+
 def read_table(path: Path, columns: Collection[Column]) -> pa.Table:
     """A whole small table; see `table_batches`. Optional columns that the file lacks are absent."""
     batches = [batch for _, batch in table_batches(path, columns)]
@@ -154,12 +166,10 @@ def _parquet_batches(path: Path, columns: Collection[Column]) -> Iterator[pa.Rec
 
 
 def _csv_batches(path: Path, columns: Collection[Column]) -> Iterator[pa.RecordBatch]:
-    reading = pcsv.ReadOptions(use_threads=False, block_size=_CSV_BLOCK_BYTES)
-    parsing = pcsv.ParseOptions(newlines_in_values=True)
-    with pcsv.open_csv(path, read_options=reading, parse_options=parsing) as header:
+    with pcsv.open_csv(path, read_options=_CSV_READING, parse_options=_CSV_PARSING) as header:
         names = _present(path, header.schema.names, columns)
     converting = pcsv.ConvertOptions(include_columns=names, column_types=dict.fromkeys(names, pa.string()))
-    with pcsv.open_csv(path, read_options=reading, parse_options=parsing, convert_options=converting) as reader:
+    with pcsv.open_csv(path, read_options=_CSV_READING, parse_options=_CSV_PARSING, convert_options=converting) as reader:
         yield from reader
 
 

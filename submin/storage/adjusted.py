@@ -25,11 +25,10 @@ from submin.errors import InputError
 from submin.formats import tables
 from submin.query.control_set import ControlSet
 from submin.sensors import sensor_named
+from submin.storage.point_table import RULE_0
 
 Array = NDArray[np.float64]
 
-RULE_0 = "derived from an adjustment: use it, but never enter it into a network, neither as block nor as control"
-"""Goes into the metadata of every file as ``use``."""
 NO_COVARIANCE = (
     "adjusted with virtual control, which is a regularisation: coordinates and cameras may be used, and no accuracy is stated, because "
     "a covariance of these equations would be too small"
@@ -177,24 +176,3 @@ def refuse_occupied(path: Path) -> None:
         raise InputError(f"{path}: is a file; expected a folder for the result")
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path}: is not empty; expected a new folder: give another one, or remove it first")
-
-
-def refuse_derived(path: str | Path) -> None:
-    """Refuse a table of points that an adjustment wrote, where surveyed ones are expected (Rule 0).
-
-    Raises
-    ------
-    InputError
-        When the file's metadata says so.
-    """
-    if Path(path).suffix.lower() != ".parquet" or not Path(path).is_file():
-        return
-    try:
-        metadata = pq.read_schema(path).metadata or {}
-    except (pa.ArrowException, OSError):
-        return  # whoever reads it says what is wrong with it
-    if metadata.get(b"use") == RULE_0.encode():
-        raise InputError(
-            f"{path}: holds points that an adjustment gave; expected surveyed points: what comes from rays, entered beside them, "
-            "counts twice"
-        )

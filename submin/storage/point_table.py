@@ -7,10 +7,11 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from submin.errors import CatalogueError, InputError
-from submin.formats.columns import Column, number, number_values, read_table, refuse, text, text_values
+from submin.formats.columns import Column, column_names, number, number_values, read_table, refuse, text, text_values
 from submin.formats.tables import covariance_of_rows
 from submin.geodesy import local_axes, rotate_covariance
 from submin.storage.catalogue_schema import COVARIANCE_COLUMNS, SIGMA_COLUMNS, PointTable, first_repeated
@@ -23,6 +24,11 @@ POINT_COLUMNS = (
     Column("covariance_row", pa.list_(pa.float64()), False),
 )  # fmt: skip
 
+RULE_0 = "derived from an adjustment: use it, but never enter it into a network, neither as block nor as control"
+"""Goes as ``use`` into the metadata of every file of points or cameras that an adjustment gave."""
+DERIVED_COLUMNS = ("ce90", "le90", "tile", "rays")
+"""What a network's answer and an adjustment say of their points, in every format; no survey counts rays or has tiles."""
+
 Covariances = Literal["definite", "any", "none"]
 """What is asked of the points' covariances; see `read_point_table`."""
 
@@ -34,15 +40,18 @@ def read_point_table(path: str | Path, covariance: Covariances = "any") -> Point
     ----------
     path : file with ``point_id``, ``longitude``, ``latitude``, ``height``, perhaps ``area``, and covariances as ``cov_ee`` ... ``cov_uu``
         (m2) or as ``sigma_e``, ``sigma_n``, ``sigma_u`` (m), or as ``covariance_row`` (joint, geocentric axes, as query output has it)
-    covariance : ``definite`` for points that control (no direction is known without error), ``any``, or ``none`` when it may be
-        absent: zeros
+    covariance : ``definite`` for points that control (surveyed ones; no direction is known without error), ``any``, or ``none`` when
+        it may be absent: zeros
 
     Raises
     ------
     CatalogueError
-        When a column is missing, an id comes twice, coordinates are out of range, or a covariance is none.
+        When a column is missing, an id comes twice, coordinates are out of range, or a covariance is none; for points that control
+        also when they were derived from rays.
     """
     file = Path(path)
+    if covariance == "definite":
+        _refuse_derived(file)
     table = read_table(file, POINT_COLUMNS)
     point_ids, n = text_values(table, "point_id"), table.num_rows
     repeated = first_repeated(np.unique(point_ids, return_inverse=True)[1], np.zeros(n, dtype=np.int8))
@@ -57,6 +66,26 @@ def read_point_table(path: str | Path, covariance: Covariances = "any") -> Point
         refuse(pa.array(~(np.abs(geodetic[:, k]) <= limit)), table[name], name, file, 1, expected)
     enu, joint = _covariances(table, file, geodetic, covariance)
     return PointTable(point_ids, geodetic, enu, text_values(table, "area"), joint)
+
+
+def _refuse_derived(path: Path) -> None:
+    """Refuse points that a network or an adjustment gave, before they are read: as control their rays count twice (Rule 0)."""
+    expected = "expected surveyed points: what comes from rays, entered beside them, counts twice"
+    derived = [name for name in column_names(path) if name.strip().lower() in DERIVED_COLUMNS]
+    if _use(path) == RULE_0:
+        raise CatalogueError(f"{path}: holds points that an adjustment gave; {expected}")
+    if derived:
+        columns = f"column{'s' * (len(derived) > 1)} {', '.join(derived)}"
+        raise CatalogueError(f"{path}: has the {columns} of points that a network or an adjustment gave; {expected}")
+
+
+def _use(path: Path) -> str:
+    """What a Parquet file says that its content may be used for."""
+    try:
+        metadata = pq.read_schema(path).metadata if path.suffix == ".parquet" else None
+    except (pa.ArrowException, OSError):
+        return ""  # whoever reads it says what is wrong with it
+    return bytes((metadata or {}).get(b"use", b"")).decode(errors="replace")
 
 
 def _covariances(table: pa.Table, path: Path, geodetic: Array, kind: Covariances) -> tuple[Array, Array | None]:

@@ -801,6 +801,8 @@ def _(w: World) -> list[Any]:
     network = w.fused
     ids = Catalogue.open(w.catalogue).points("check").point_ids[:2]  # type: ignore[union-attr]
     submin.open(network).query(points=ids).to_parquet(w.folder / "joint.parquet")
+    surveyed = pq.read_table(w.folder / "joint.parquet").drop_columns(["ce90", "le90", "tile", "rays"])
+    pq.write_table(surveyed, w.folder / "joint.parquet")
     return ["control", "add", network, w.folder / "joint.parquet"]
 
 
@@ -902,6 +904,36 @@ def _(w: World) -> list[Any]:
     catalogue = Catalogue.open(w.catalogue)
     write(adjust(catalogue, w.block()), w.new)
     return ["control", "add", w.fused, w.new / "points.parquet"]
+
+
+def answered(w: World, path: Path) -> Path:
+    """What the network answers of all its points, as a file."""
+    submin.open(str(w.fused)).query(bbox=(-180.0, -90.0, 180.0, 90.0)).write(path)
+    return path
+
+
+for suffix in ("csv", "parquet"):
+
+    @case(f"answer of a network added as control, {suffix}")
+    def _(w: World, suffix: str = suffix) -> list[Any]:
+        return ["control", "add", w.fused, answered(w, w.folder / f"answer.{suffix}")]
+
+    @case(f"answer of a network as control of a run, {suffix}")
+    def _(w: World, suffix: str = suffix) -> list[Any]:
+        answered(w, w.catalogue / f"control.{suffix}")
+        return ["run", w.catalogue, w.network]
+
+    @case(f"answer of a network as control of an adjustment, {suffix}")
+    def _(w: World, suffix: str = suffix) -> list[Any]:
+        answered(w, w.catalogue / f"control.{suffix}")
+        return adjusting(w)
+
+
+@case("one column of an answer left in control")
+def _(w: World) -> list[Any]:
+    table = pcsv.read_csv(answered(w, w.folder / "answer.csv")).drop_columns(["tile", "ce90", "le90"])
+    pcsv.write_csv(table, w.folder / "few.csv")
+    return ["control", "add", w.fused, w.folder / "few.csv"]
 
 
 # --- imports ----------------------------------------------------------------------------------------------------------------------------
