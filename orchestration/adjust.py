@@ -42,6 +42,8 @@ Flags = NDArray[np.bool_]
 
 DEFAULT_POINTS = 2000
 """Control points that a block takes from a network, and points that are written with their joint covariance (288 MB), at most."""
+MOST_CHECKED = 2000
+"""Check points that are compared with their joint covariance, at most."""
 CONTRADICTED = 1e-3
 """Control whose innovation is as improbable as this, all together, is said to contradict the block."""
 
@@ -126,6 +128,11 @@ def adjust(
     return adjusted
 
 
+def named(block_id: str) -> str:
+    """A block in a sentence, also when its id says already that it is one."""
+    return block_id if block_id.lower().startswith("block") else f"block {block_id}"
+
+
 def write(adjusted: Adjusted, out: str | Path) -> None:
     """Write the folder of a result: cameras, covariance, points, report.
 
@@ -155,7 +162,7 @@ def _judged(block: Block, catalogue: Catalogue, network: str | None, version: st
         outcome = adjust_block(block_rays(block), ellipsoid)
         reason = outcome.reason or disagreement(outcome.accepted)
     if reason is not None:
-        raise InputError(f"block {block.block_id}: {reason}")
+        raise InputError(f"{named(block.block_id)}: {reason}")
     images = image_set(network_images(block), ellipsoid, parameters)
     ids, point = np.unique(block.point_ids, return_inverse=True)
     observed, sigma = np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line])
@@ -167,7 +174,7 @@ def _refuse_known(block: Block, ledger: Ledger, network: str) -> None:
     for image in block.images:
         if image.image_id in ledger.block_of_image:
             raise InputError(
-                f"{network}: image {image.image_id} is in the network already, in block {ledger.block_of_image[image.image_id]}: its rays "
+                f"{network}: image {image.image_id} is in the network already, in {named(ledger.block_of_image[image.image_id])}: its rays "
                 "are in that control, and would count twice; use 'submin readjust'"
             )
 
@@ -179,7 +186,7 @@ def _with_control(
     try:
         result = adjust_controlled(judged.images, judged.rays, judged.start, prior_of)
     except SubminError as error:
-        raise InputError(f"block {judged.block.block_id}: {error}") from None
+        raise InputError(f"{named(judged.block.block_id)}: {error}") from None
     found, ids = result.estimate, judged.ids
     count = np.bincount(judged.rays.point[judged.rays.accepted], minlength=len(ids))
     controlled = np.zeros(len(ids), dtype=np.bool_)
@@ -294,7 +301,7 @@ def _virtually(judged: _Judged, design: VirtualDesign, metadata: CatalogueMetada
     except InputError:
         raise
     except SubminError as error:
-        raise InputError(f"block {judged.block.block_id}: {error}") from None
+        raise InputError(f"{named(judged.block.block_id)}: {error}") from None
     count = np.bincount(judged.rays.point[accepted], minlength=len(judged.ids))
     known = np.flatnonzero(np.isfinite(found.ground).all(axis=1) & (count > 1))
     shown = _spread(known, np.zeros(len(judged.ids), dtype=np.bool_), count, found.ground, most)
@@ -303,7 +310,7 @@ def _virtually(judged: _Judged, design: VirtualDesign, metadata: CatalogueMetada
     values = {
         "block": judged.block.block_id, "images": len(images), "points": len(known), "points_written": len(shown),
         "control_points": 0, "virtual_points": len(control.image), "control_from": "virtual", "weight": design.weight,
-        "chi_square": None, "redundancy": found.redundancy, "variance_factor": None, "status": "regularised",
+        "chi_square": None, "redundancy": None, "variance_factor": None, "status": "regularised",
         "accuracy": NO_COVARIANCE, "control_rejected": [], "images_flagged": [], "rejected_rays": _rejected(judged),
         "rays": int(accepted.sum()), "iterations": found.iterations, "use": RULE_0,
         "check": None if check is None else _checked(judged, check, known, found.ground, None),
@@ -342,19 +349,20 @@ def _point_set(
 def _checked(
     judged: _Judged, check: PointTable, rows: NDArray[np.int64], ground: Array, covariance_of: Callable[[NDArray[np.int64]], Array] | None
 ) -> dict[str, Any] | None:
-    """Errors of adjusted points (rows) against check points, which take no part in the adjustment."""
+    """Errors of adjusted points (rows) against check points, which take no part in the adjustment; ``left_out`` counts those too many."""
     _, at, row = np.intersect1d(judged.ids[rows], check.point_ids, return_indices=True)
     if not len(at):
         return None
-    at, row = at[:DEFAULT_POINTS], row[:DEFAULT_POINTS]
+    compared = len(at) if covariance_of is None else min(len(at), MOST_CHECKED)
+    left_out, at, row = len(at) - compared, at[:compared], row[:compared]
     chosen, axes = rows[at], local_axes(check.geodetic[row])
     error = ground[chosen] - geodetic_to_geocentric(check.geodetic[row], judged.images.ellipsoid)
     enu = np.einsum("nij,nj->ni", axes, error)
     if covariance_of is None:
         rms = np.sqrt((enu**2).mean(axis=0)).tolist()
-        return {"points": len(at)} | dict(zip(("rms_east", "rms_north", "rms_up"), rms, strict=True))
+        return {"points": len(at), "left_out": left_out} | dict(zip(("rms_east", "rms_north", "rms_up"), rms, strict=True))
     joint = covariance_of(chosen)
     k = np.arange(len(at))
     joint.reshape(len(k), 3, len(k), 3)[k, :, k, :] += np.swapaxes(axes, 1, 2) @ check.covariance_enu[row] @ axes
     own = axes @ joint.reshape(len(k), 3, len(k), 3)[k, :, k, :] @ np.swapaxes(axes, 1, 2)
-    return accuracy_against_truth(enu, own).to_mapping() | {"nees_per_dof": nees_per_dof(error.ravel(), joint)}
+    return accuracy_against_truth(enu, own).to_mapping() | {"nees_per_dof": nees_per_dof(error.ravel(), joint), "left_out": left_out}

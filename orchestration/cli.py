@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -64,6 +65,20 @@ def check_range(option: str, value: int, least: int, most: int | None = None) ->
         from submin.errors import InputError
 
         raise InputError(f"{option} is {value}; expected {least} {'or more' if most is None else f'to {most}'}")
+
+
+def check_applies(given: Mapping[str, object], needed: str) -> None:
+    """Refuse options (None: not given) that say something only beside another one."""
+    for option, value in given.items():
+        if value is not None:
+            from submin.errors import InputError
+
+            raise InputError(f"{option} is given without {needed}, where it says nothing; give {needed} too, or leave {option} out")
+
+
+def counted(number: int, noun: str) -> str:
+    """Such as 1 block, 2,000 blocks."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 @import_app.command("rpc")
@@ -407,7 +422,9 @@ def adjust(
     network: Annotated[
         str | None, typer.Option("--network", help="Network that controls it; without one the catalogue's control table does, if any.")
     ] = None,
-    policy: Annotated[str, typer.Option("--policy", help="Of the network's answer: auto, tile, ci or rigorous.")] = "auto",
+    policy: Annotated[
+        str | None, typer.Option("--policy", help="Of the network's answer: auto, tile, ci or rigorous; default auto.")
+    ] = None,
     at: Annotated[str | None, typer.Option("--at", help="Version of the network, such as v12.")] = None,
     max_points: Annotated[
         int, typer.Option("--max-points", help="Control points taken, and points written with joint covariance, at most.")
@@ -416,10 +433,12 @@ def adjust(
         int | None,
         typer.Option("--virtual-control", metavar="N", help="N x N virtual control points an image: no accuracy is stated then."),
     ] = None,
-    virtual_sigma: Annotated[float, typer.Option("--virtual-sigma", help="Positioning accuracy of an image, pixels.")] = 7.5,
+    virtual_sigma: Annotated[
+        float | None, typer.Option("--virtual-sigma", help="Positioning accuracy of an image, pixels; default 7.5.")
+    ] = None,
     virtual_weight: Annotated[
-        str, typer.Option("--virtual-weight", help="plain or balanced (times tie points over virtual ones).")
-    ] = "plain",
+        str | None, typer.Option("--virtual-weight", help="plain, the default, or balanced (times tie points over virtual ones).")
+    ] = None,
     virtual_height: Annotated[
         float | None, typer.Option("--virtual-height", help="Height of the virtual points, m; default: each camera's mean height.")
     ] = None,
@@ -429,21 +448,30 @@ def adjust(
 
     Example: submin adjust catalogue --block PASS_7 --network network --out adjusted
     """
-    from orchestration.adjust import VirtualDesign, write
+    from orchestration.adjust import VirtualDesign, named, write
     from orchestration.adjust import adjust as stage_one
     from submin.storage.adjusted import refuse_occupied
     from submin.storage.catalogue import Catalogue
 
     check_range("--max-points", max_points, 1)
+    design = None
+    if virtual_control is None:
+        virtual = {"--virtual-sigma": virtual_sigma, "--virtual-weight": virtual_weight, "--virtual-height": virtual_height}
+        check_applies(virtual, "--virtual-control")
+    else:
+        sigma = 7.5 if virtual_sigma is None else virtual_sigma
+        design = VirtualDesign(virtual_control, sigma, virtual_weight or "plain", virtual_height)
+    if network is None:
+        check_applies({"--policy": policy, "--at": at}, "--network")
     refuse_occupied(output)
-    design = None if virtual_control is None else VirtualDesign(virtual_control, virtual_sigma, virtual_weight, virtual_height)
-    done = stage_one(Catalogue.open(catalogue), block, network, version=at, policy=policy, most=max_points, virtual=design)
+    done = stage_one(Catalogue.open(catalogue), block, network, version=at, policy=policy or "auto", most=max_points, virtual=design)
     write(done, output)
     values = done.values
     factor = "" if values["variance_factor"] is None else f", variance factor {values['variance_factor']:.3g}"
     lines = [
-        f"block {block}: {values['images']} images, {values['points']:,} points, {values['control_points']} control points, "
-        f"{len(values['rejected_rays'])} rays rejected{factor}; {values['status']}; written to {output}"
+        f"{named(block)}: {counted(values['images'], 'image')}, {counted(values['points'], 'point')}, "
+        f"{counted(values['control_points'], 'control point')}, {counted(len(values['rejected_rays']), 'ray')} rejected{factor}; "
+        f"{values['status']}; written to {output}"
     ]
     if "innovation" in values and values["innovation"]["dof"]:
         test = values["innovation"]
@@ -451,6 +479,8 @@ def adjust(
             f"control against block: chi-square {test['d2']:.1f}, {test['dof']} degrees of freedom, probability {test['probability']:.2g}"
         )
     lines += [values["accuracy"]] if design is not None else []
+    if values["check"] and values["check"]["left_out"]:
+        lines.append(f"{values['check']['points']:,} check points compared, the first by id; {values['check']['left_out']:,} left out")
     lines += [f"bad camera {f['image_id']}: {f['reason']}" for f in values["images_flagged"]]
     lines += [f"control point {r['point_id']}: {r['reason']}" for r in values["control_rejected"]]
     show({**values, "out": str(output)}, as_json, "\n".join(lines))
@@ -484,11 +514,12 @@ def readjust(
     done = readjust_network(Catalogue.open(catalogue), network, output, block=block, policy=policy, deweight=deweight, version=at)
     values = done.to_json()
     lines = [
-        f"{done.images} images of {done.blocks} blocks, from the points of {network} {done.version} ({values['status']}); "
-        f"written to {output}"
+        f"{counted(done.images, 'image')} of {counted(done.blocks, 'block')}, from the points of {network} {done.version} "
+        f"({values['status']}; policy {', '.join(done.policies) or 'none'} over {counted(len(done.tiles), 'tile')}); written to {output}"
     ]
+    lines += [f"camera {name}: its a priori model was given up, as the network did" for name in done.images_released]
     if done.blocks_missing:
-        lines.append(f"{len(done.blocks_missing)} blocks are not in the network: {', '.join(done.blocks_missing[:5])}")
+        lines.append(f"not in the network: {counted(len(done.blocks_missing), 'block')}, such as {', '.join(done.blocks_missing[:5])}")
     show({**values, "out": str(output)}, as_json, "\n".join(lines))
 
 

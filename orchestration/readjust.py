@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orchestration.run import check_frames
 from submin.errors import InputError
+from submin.query.planner import check_policy
 from submin.query.readjustment import Readjusted, coupled_images, readjust
 from submin.storage.adjusted import AdjustedCameras, AdjustedWriter
 from submin.storage.arrays import group_of, read_record
@@ -28,13 +29,15 @@ class ReadjustResult:
 
     Attributes
     ----------
+    policies, tiles : that the points of the groups come from; a group without accepted rays has none
     blocks, images, groups : how many; images of a group are adjusted together and have a joint covariance
     blocks_missing : blocks of the catalogue that the network does not have
     rays : accepted ones of these images
     """
 
     version: str
-    policy: str
+    policies: tuple[str, ...]
+    tiles: tuple[str, ...]
     deweight: float | None
     blocks: int
     images: int
@@ -46,11 +49,12 @@ class ReadjustResult:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
-        status = "rigorous" if self.deweight is None else "de-weighted"
+        status = "resection" if self.deweight is None else "de-weighted"
         return {
-            "version": self.version, "policy": self.policy, "deweight": self.deweight, "status": status, "blocks": self.blocks,
-            "images": self.images, "groups": self.groups, "rays": self.rays, "images_released": list(self.images_released),
-            "blocks_missing": list(self.blocks_missing), "use": RULE_0, "seconds": self.seconds,
+            "version": self.version, "policies": list(self.policies), "tiles": list(self.tiles), "deweight": self.deweight,
+            "status": status, "blocks": self.blocks, "images": self.images, "groups": self.groups, "rays": self.rays,
+            "images_released": list(self.images_released), "blocks_missing": list(self.blocks_missing), "use": RULE_0,
+            "seconds": self.seconds,
         }  # fmt: skip
 
 
@@ -63,11 +67,13 @@ def readjust_network(
     Raises
     ------
     InputError
-        When the frame is another, the network has none of the blocks (or not the one named), or ``deweight`` is below 1.
+        When the frame is another, the network has none of the blocks (or not the one named), ``deweight`` is below 1, the policy is
+        unknown, or it is ``tile`` and no one tile holds the points of a group.
     """
     started = time.monotonic()
     if deweight is not None and not (np.isfinite(deweight) and deweight >= 1.0):
         raise InputError(f"--deweight is {deweight:g}; expected 1 or more: the factor of the images' a priori sigmas")
+    check_policy(policy)
     opened = Network(network, version)
     check_frames(catalogue, opened.snapshot)
     fused = {entry.block_id for entry in Ledger.of(opened.snapshot).fused()}
@@ -75,21 +81,27 @@ def readjust_network(
     missing = tuple(name for name in asked if name not in fused)
     wanted = set(asked) - set(missing)
     if not wanted:
-        named = f"block {block!r} is not" if block is not None else f"none of the {len(asked)} blocks of {catalogue.path} is"
+        named = f"block {block!r} is not" if block is not None else f"no block of {catalogue.path}, which has {len(asked)}, is"
         raise InputError(f"{network} {opened.version}: {named} in the network; 'submin adjust' controls new blocks")
     block_of, groups = _groups(opened, wanted)
     cells = _cells_of(opened, {int(row) for group in groups for row in group})
     released: list[str] = []
+    policies: set[str] = set()
+    tiles: set[int] = set()
     images = rays = 0
-    metadata = {"command": "submin readjust", "version": opened.version, "policy": policy}
+    metadata = {"command": "submin readjust", "version": opened.version, "policy_asked": policy}
     with AdjustedWriter(out, True, metadata if deweight is None else metadata | {"deweight": f"{deweight:g}"}) as writer:
         for found in readjust(opened, groups, cells, policy, deweight):
             cameras = _cameras_of(found, np.isin(block_of[found.rows], list(wanted)))
             writer.write_cameras(cameras)
+            if found.tiles:
+                policies.add(found.policy)
+                tiles.update(found.tiles)
             images, rays = images + len(cameras.images), rays + int(cameras.rays.sum())
             released += [name for name, r in zip(cameras.images.ids, cameras.released, strict=True) if r]
         result = ReadjustResult(
-            opened.version, policy, deweight, len(wanted), images, len(groups), rays, tuple(released), missing, time.monotonic() - started
+            opened.version, tuple(sorted(policies)), tuple(opened.cover.tile_name(t) for t in sorted(tiles)), deweight, len(wanted), images,
+            len(groups), rays, tuple(released), missing, time.monotonic() - started,
         )  # fmt: skip
         writer.write_report(result.to_json())
     return result

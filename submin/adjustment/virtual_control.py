@@ -59,14 +59,11 @@ class VirtuallyControlled:
     Attributes
     ----------
     theta : (m, p) corrections; ground : (n, 3) geocentric metres, NaN for points that are not determined
-    residual_squares : weighted squares of the rays' residuals; redundancy : of the rays and the virtual points
     iterations : linearisations
     """
 
     theta: Array
     ground: Array
-    residual_squares: float
-    redundancy: int
     iterations: int
 
 
@@ -87,13 +84,15 @@ def virtual_control(
     Raises
     ------
     InputError
-        When the grid, sigma or weight is none, or a camera does not reach the datum.
+        When the grid, sigma, weight or height is none, or a camera does not reach the datum.
     """
     if grid < 1 or not (np.isfinite(sigma) and sigma > 0.0) or weight not in WEIGHTS:
         raise InputError(
             f"virtual control of {grid} x {grid} points, sigma {sigma:g}, weight {weight!r}; expected 1 or more, a positive number, and "
             f"one of {', '.join(WEIGHTS)}"
         )
+    if height is not None and not np.isfinite(height):
+        raise InputError(f"height of the virtual control is {height:g}; expected a finite number, metres above the ellipsoid")
     centre = (np.arange(grid) + 0.5) / grid
     across, down = (part.ravel() for part in np.meshgrid(centre, centre))
     place = np.stack([across, down], axis=1)
@@ -176,5 +175,5 @@ def adjust_virtually(images: ImageSet, rays: Rays, start: Array, control: Virtua
         theta, ground = found.theta, start + offset
         if moved < CONVERGED_SIGMAS and shift < CONVERGED_METRES:
             known = np.where((factors.rank == 3)[:, None], ground, np.nan)
-            return VirtuallyControlled(theta, known, float(found.chi_square), sums.redundancy, iteration)
+            return VirtuallyControlled(theta, known, iteration)
     raise NumericalError(f"the adjustment with virtual control did not converge in {MAX_ITERATIONS} iterations; check the block's cameras")

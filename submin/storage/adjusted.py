@@ -81,19 +81,20 @@ class AdjustedWriter:
         refuse_occupied(self.path)
         self._place = self.path.resolve()
         self._folder = self._place.with_name(f".{self._place.name}.{uuid4().hex}")
+        self._made: list[Path] = []
         self._groups = 0
         self._cameras: pq.ParquetWriter | None = None
 
     def __enter__(self) -> Self:
         try:
-            self._place.parent.mkdir(parents=True, exist_ok=True)
+            self._make_parents()
             self._folder.mkdir()
             schema = pa.schema([*_CAMERA_COLUMNS, *(_COVARIANCE_COLUMNS if self.accuracy else ())]).with_metadata(self.metadata)
             self._cameras = pq.ParquetWriter(self._folder / "cameras.parquet", schema, compression="zstd")
             if self.accuracy:
                 (self._folder / "covariance").mkdir()
         except OSError as cause:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            self._remove()
             raise self._unwritable(cause) from cause
         return self
 
@@ -111,7 +112,22 @@ class AdjustedWriter:
         except OSError as cause:
             raise self._unwritable(cause) from cause
         finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            self._remove()
+
+    def _make_parents(self) -> None:
+        """Make the folders above the result's, and remember which of them there were not."""
+        for folder in reversed([folder for folder in self._place.parents if not folder.exists()]):
+            folder.mkdir(exist_ok=True)
+            self._made.append(folder)
+
+    def _remove(self) -> None:
+        """Remove what is not the result: after a failure also the folders above it that were made; those with something in them stay."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+        for folder in reversed(self._made):
+            try:
+                folder.rmdir()
+            except OSError:
+                return
 
     def write_cameras(self, cameras: AdjustedCameras) -> None:
         """Append images that were adjusted together: a row for each adjustable parameter, and one file with their joint covariance."""

@@ -153,7 +153,9 @@ class Catalogue:
     def block(self, block_id: str) -> Block:
         """One block; raises `CatalogueError` for an unknown one."""
         if block_id not in self._images_of:
-            raise CatalogueError(f"{self.path}: no block {block_id!r}; expected one of its {self.block_count} blocks")
+            few, more = self.block_ids[:5], self.block_count - 5
+            names = "one of " * (self.block_count > 1) + ", ".join(few) + (f" and {more:,} more" if more > 0 else "")
+            raise CatalogueError(f"{self.path}: no block {block_id!r}; expected {names}")
         path = required_path(self.path, "measurements")
         for found, row, table in _runs(path):
             if found == block_id:

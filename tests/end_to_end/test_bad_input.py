@@ -837,7 +837,16 @@ simply("adjustment with no point at most", lambda w: adjusting(w, "--max-points"
 simply("virtual control beside a network", lambda w: adjusting(w, "--virtual-control", 3, network=True))
 simply("virtual control of unknown weight", lambda w: adjusting(w, "--virtual-control", 3, "--virtual-weight", "heavy"))
 simply("virtual control of too few points", lambda w: adjusting(w, "--virtual-control", 1))
-simply("virtual control out of reach", lambda w: adjusting(w, "--virtual-control", 3, "--virtual-height", "nan"))
+simply("virtual control out of reach", lambda w: adjusting(w, "--virtual-control", 3, "--virtual-height", 1e12))
+simply("virtual control at no height", lambda w: adjusting(w, "--virtual-control", 3, "--virtual-height", "nan"))
+for option, value in (("sigma", 5), ("weight", "plain"), ("height", 0)):
+    simply(
+        f"adjustment with --virtual-{option} and no --virtual-control",
+        lambda w, words=(f"--virtual-{option}", value): adjusting(w, *words, network=True),
+    )
+simply("adjustment with --policy and no --network", lambda w: adjusting(w, "--policy", "auto"))
+simply("adjustment with --at and no --network", lambda w: adjusting(w, "--at", "v1"))
+simply("readjustment by an unknown policy", lambda w: ["readjust", w.catalogue, w.fused, "--out", w.new / "a" / "b", "--policy", "best"])
 simply("readjustment of a block that is not in the network", lambda w: [*readjusting(w, w.network), "--block", w.block()])
 simply("readjustment of a catalogue that is not in the network", lambda w: readjusting(w, w.network))
 simply("de-weighting that gives weight", lambda w: [*readjusting(w, w.fused), "--deweight", 0.5])

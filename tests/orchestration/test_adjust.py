@@ -14,7 +14,7 @@ from networks import SMALL, area_of, by_image, fuse, rewrite
 from numpy.typing import NDArray
 
 import submin
-from orchestration.adjust import Adjusted, VirtualDesign, adjust, write
+from orchestration.adjust import Adjusted, VirtualDesign, adjust, named, write
 from submin.accuracy import nees_band
 from submin.adjustment.control import ControlledPrior, surveyed
 from submin.adjustment.images import ImageSet
@@ -207,6 +207,23 @@ def test_surveyed_control_and_check_points_of_a_catalogue(world: World, tmp_path
     assert np.abs((joint.points.covariance - held.points.covariance) / sigma / sigma[:, None]).max() < 1e-8
 
 
+def test_check_points_that_are_too_many_are_counted(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ids = np.unique(world.catalogue.block(BLOCK).point_ids)
+    catalogue = with_points(world, tmp_path / "catalogue", check=truth_of(world, ids, 0.1))
+    every = adjust(catalogue, BLOCK).values["check"]
+    assert every["left_out"] == 0
+    monkeypatch.setattr("orchestration.adjust.MOST_CHECKED", 7)
+    few = adjust(catalogue, BLOCK).values["check"]
+    assert (few["points"], few["left_out"]) == (7, every["points"] - 7)
+    virtual = adjust(catalogue, BLOCK, virtual=VirtualDesign(3, 7.5)).values["check"]  # without covariance nothing is large
+    assert virtual["points"] >= every["points"] and virtual["left_out"] == 0
+
+
+@pytest.mark.parametrize(("block_id", "expected"), [("T-7", "block T-7"), ("block 5", "block 5"), ("Block_5", "Block_5")])
+def test_a_block_is_called_one_once(block_id: str, expected: str) -> None:
+    assert named(block_id) == expected
+
+
 def diagonal(self: NetworkControl, block: ImageSet, points: NDArray[np.str_]) -> ControlledPrior:
     """The control with 3 x 3 covariances only: what must not be done."""
     whole = FULL(self, block, points)
@@ -263,7 +280,8 @@ def test_virtual_control_leaves_everything_out_that_states_accuracy(world: World
     for table in (cameras, points):
         assert b"no accuracy is stated" in table.schema.metadata[b"accuracy"]
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert (report["status"], report["virtual_points"], report["chi_square"]) == ("regularised", 27, None)
+    assert (report["status"], report["virtual_points"]) == ("regularised", 27)
+    assert (report["chi_square"], report["redundancy"], report["variance_factor"]) == (None, None, None)
     assert report["check"]["points"] == len(points) and "nees_per_dof" not in report["check"]
     assert report["check"]["rms_up"] < 60.0
     with pytest.raises(InputError, match="virtual control and a network are given"):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 from networks import area_of, fuse, rewrite
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from orchestration.executors import SerialExecutor
 from orchestration.readjust import readjust_network
 from orchestration.withdraw import withdraw
 from submin.simulation.region import SimulatedRegion
+from submin.storage.adjusted import AdjustedWriter
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import PointTable
 
@@ -42,7 +44,9 @@ def test_every_camera_of_a_network_is_written(catalogue: Path, complete: Path, r
     found = cameras(tmp_path / "out")
     assert set(found) == {image.image_id for image in region.images}
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert (report["version"], report["status"]) == ("v1", "rigorous")
+    assert (report["version"], report["status"]) == ("v1", "resection")
+    assert (result.policies, report["policies"], report["policy_asked"]) == (("rigorous",), ["rigorous"], "rigorous")
+    assert report["tiles"] == list(result.tiles) and len(result.tiles) > 1
     assert b"never enter it into a network" in pq.read_schema(tmp_path / "out" / "cameras.parquet").metadata[b"use"]
     # against the truth: every component by its sigma
     rows = {image.image_id: k for k, image in enumerate(region.images)}
@@ -77,6 +81,28 @@ def test_withdrawn_images_and_control_are_not_readjusted(
     assert set(before) - set(after) == {"T001-001-NAD"} and result.images == 35
     kept = [name for name in after if name not in result.images_released]
     assert np.median([after[name][1][0, 0] / before[name][1][0, 0] for name in kept]) < 0.9  # control tells the cameras too
+
+
+def test_the_policy_and_the_tiles_that_were_used_are_said(catalogue: Path, complete: Path, tmp_path: Path) -> None:
+    """``auto`` is no policy that gives points."""
+    result = readjust_network(Catalogue.open(catalogue), str(complete), tmp_path / "out")
+    assert set(result.policies) and set(result.policies) <= {"tile", "rigorous"}
+    names = {f"r{row:03d}c{column:03d}" for row in range(9) for column in range(9)}
+    assert result.tiles and set(result.tiles) <= names
+    assert result.to_json()["policies"] == list(result.policies)
+
+
+def test_a_result_that_fails_leaves_no_folder(tmp_path: Path) -> None:
+    """Folders above it that were there, or that have got something else, stay."""
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(RuntimeError), AdjustedWriter(tmp_path / "mine" / "a" / "b" / "out", True, {}):
+        assert (tmp_path / "mine" / "a" / "b").is_dir()
+        raise RuntimeError
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
+    with pytest.raises(RuntimeError), AdjustedWriter(tmp_path / "mine" / "a" / "b" / "out", True, {}):
+        (tmp_path / "mine" / "a" / "other").write_text("mine")
+        raise RuntimeError
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "mine", "other"]
 
 
 def test_deweighted_cameras_say_so(catalogue: Path, complete: Path, tmp_path: Path) -> None:
