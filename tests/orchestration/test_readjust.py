@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,12 @@ import pytest
 from networks import area_of, fuse, rewrite
 from numpy.typing import NDArray
 
+from orchestration.cli import main
 from orchestration.control import add_control
 from orchestration.executors import SerialExecutor
 from orchestration.readjust import readjust_network
 from orchestration.withdraw import withdraw
+from submin.errors import CatalogueError
 from submin.simulation.region import SimulatedRegion
 from submin.storage.adjusted import AdjustedWriter
 from submin.storage.catalogue import Catalogue
@@ -90,6 +93,32 @@ def test_the_policy_and_the_tiles_that_were_used_are_said(catalogue: Path, compl
     names = {f"r{row:03d}c{column:03d}" for row in range(9) for column in range(9)}
     assert result.tiles and set(result.tiles) <= names
     assert result.to_json()["policies"] == list(result.policies)
+
+
+def test_released_cameras_are_said_to_people(
+    catalogue: Path,
+    complete: Path,
+    region: SimulatedRegion,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["submin", "readjust", str(catalogue), str(complete), "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr().out
+    assert not ended.value.code and said.startswith("36 images of 12 blocks, from the points of ")
+    for name in region.bad_cameras:
+        assert f"camera {name}: its a priori model was given up" in said
+
+
+def test_an_unknown_block_is_answered_with_some_that_there_are(catalogue: Path, tmp_path: Path) -> None:
+    opened = Catalogue.open(catalogue)
+    with pytest.raises(CatalogueError, match=rf"no block 'B'; expected one of {', '.join(opened.block_ids[:5])} and 7 more$"):
+        opened.block("B")
+    one = rewrite(catalogue, tmp_path / "one", list(opened.blocks())[:1])
+    with pytest.raises(CatalogueError, match=rf"no block 'B'; expected {opened.block_ids[0]}$"):
+        Catalogue.open(one).block("B")
 
 
 def test_a_result_that_fails_leaves_no_folder(tmp_path: Path) -> None:

@@ -273,3 +273,11 @@ def test_the_import_needs_no_command_line(data: Path, tmp_path: Path, apollo: Ma
     import_isis(data / NAME / "apolloNet.pvl.gz", data / NAME, tmp_path / "catalogue")
     ours, theirs = (next(iter(Catalogue.open(place).blocks())) for place in (tmp_path / "catalogue", apollo.catalogue))
     assert ours.content_hash() == theirs.content_hash()
+
+
+def test_a_block_adjusted_by_itself_takes_all_its_control(apollo: Made, tmp_path: Path) -> None:
+    """Unadjusted cameras pass control by kilometres, as far as their priors let them: it is not of another place."""
+    said = command("adjust", apollo.catalogue, "--block", Catalogue.open(apollo.catalogue).block_ids[0], "--out", tmp_path / "adjusted")
+    assert (said["control_points"], said["control_rejected"], said["images_flagged"]) == (32, [], [])
+    assert (said["status"], said["control_from"]) == ("controlled", "survey")
+    assert {(ray["point_id"].removeprefix(f"{NAME}/"), ray["image_id"]) for ray in said["rejected_rays"]} >= set(BLUNDERS)

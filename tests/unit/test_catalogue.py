@@ -159,7 +159,7 @@ class TestRoundTrip:
         catalogue = Catalogue.open(folder)
         assert [b.block_id for b in catalogue.blocks(skip={"A"})] == ["B"]
         assert same_rays(catalogue.block("B"), block("B", 2))
-        with pytest.raises(CatalogueError, match="no block 'C'"):
+        with pytest.raises(CatalogueError, match="no block 'C'; expected one of A, B$"):
             catalogue.block("C")
 
     def test_a_block_without_measurements_comes_last_and_is_defect(self, folder: Path) -> None:
