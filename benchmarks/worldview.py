@@ -352,7 +352,7 @@ def plot(layout: Layout, networks: Networks, predicted: dict[str, tuple[float, f
     chart.plot(control[:, 0], control[:, 1], "^", color="tab:red", ms=7, label="sparse control (Table 6)")
     chart.set(xlabel="longitude, degrees", ylabel="latitude, degrees", aspect=1.0 / np.cos(np.radians(37.0)))
     chart.set_title("CE90 of the fused points, m (simulated)")
-    chart.legend(loc="lower right")
+    chart.legend(loc="upper right")
     figure.colorbar(points, ax=chart, shrink=0.7)
     place = np.arange(len(TABLES))
     for k, (name, colour) in enumerate((("CE", "tab:blue"), ("LE", "tab:orange"))):
