@@ -14,7 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import faults, five_blocks, main_job, stage_one, worldview
+from benchmarks.comparison import DATA, MET
 from benchmarks.machine import machine
+from orchestration.text_tables import as_wide_as
 
 BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "main-job": ("the rate of every station from rays to a committed network", main_job.measure),
@@ -23,6 +25,9 @@ BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "five-blocks": ("Tables 2 and 3 of the 2008 paper; sequential = simultaneous; consistent", five_blocks.measure),
     "worldview": ("Tables 3 to 6 of the 2010 paper; pair = cell = simultaneous; time a pair", worldview.measure),
 }
+
+GOOD = (MET, DATA, faults.IDENTICAL, "")
+"""Verdicts that ask for nothing; the paper's own lines have none."""
 
 
 def command(
@@ -34,7 +39,7 @@ def command(
     figures: Annotated[Path | None, typer.Option("--out", help="five-blocks, worldview: folder for figures.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Run a benchmark and print it beside the machine that it ran on."""
+    """Run a benchmark and print it beside the machine that it ran on. Exit code 1 when something that is asked for is not met."""
     out = Console(highlight=False)
     if name is None:
         for key, (claim, _) in BENCHMARKS.items():
@@ -53,13 +58,15 @@ def command(
     host = machine()
     if as_json:
         sys.stdout.write(json.dumps({"benchmark": name, "scale": scale, "machine": host, "rows": rows}) + "\n")
-        return
-    for columns, alike in groupby(rows, tuple):  # rows of other columns are another table
-        table = Table(*columns)
-        for row in alike:
-            table.add_row(*(f"{v:,.4g}" if isinstance(v, float) else f"{v:,}" if isinstance(v, int) else str(v) for v in row.values()))
-        out.print(table)
-    out.print(", ".join(f"{key} {value}" for key, value in host.items()), soft_wrap=True)
+    else:
+        for columns, alike in groupby(rows, tuple):  # rows of other columns are another table
+            table = Table(*columns)
+            for row in alike:
+                table.add_row(*(f"{v:,.4g}" if isinstance(v, float) else f"{v:,}" if isinstance(v, int) else str(v) for v in row.values()))
+            Console(highlight=False, width=as_wide_as(table)).print(table)
+        out.print(", ".join(f"{key} {value}" for key, value in host.items()), soft_wrap=True)
+    if any(row.get("verdict", MET) not in GOOD for row in rows):
+        raise typer.Exit(1)
 
 
 if __name__ == "__main__":

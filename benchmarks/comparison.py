@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import poisson
 
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import SerialExecutor
@@ -18,9 +19,28 @@ from submin.storage.catalogue_schema import Block
 
 Array = NDArray[np.float64]
 
-MET, NOT_MET = "met", "NOT MET"
+MET, NOT_MET, DATA = "met", "NOT MET", "data"
 ONE_TILE_KM = 2000.0
 """Side of a core that holds everything."""
+
+
+def widened(half_width: float, runs: int, full: int) -> float:
+    """Half-width of a band for the mean over fewer realisations than it was made for.
+
+    Errors within a realisation hang together, so it is realisations that count and not points: the scatter goes with the square root of
+    their number. More of them than at full scale do not make a band narrower: what is wanted is what is wanted.
+    """
+    return half_width * float(np.sqrt(max(1.0, full / runs)))
+
+
+def rejections_allowed(part: float, trials: int, runs: int, full: int) -> float:
+    """Largest part of trials in which something rare may happen that happens in ``part`` of them at most.
+
+    Over fewer realisations than the full number a single one weighs more: what a Poisson number stays below with probability 0.999.
+    """
+    if runs >= full:
+        return part
+    return max(part, float(poisson.ppf(0.999, part * trials)) / trials)
 
 
 def verdict(met: bool) -> str:
@@ -45,7 +65,7 @@ def below(claim: str, limit: float, found: float) -> dict[str, Any]:
 
 def data(claim: str, remark: str, found: float) -> dict[str, Any]:
     """A row for a number of which nothing is wanted."""
-    return {"claim": claim, "wanted": remark, "found": found, "verdict": "data"}
+    return {"claim": claim, "wanted": remark, "found": found, "verdict": DATA}
 
 
 def network_of(catalogue: Catalogue, place: Path, batches: Iterable[Sequence[Block]], tile_km: float = ONE_TILE_KM) -> str:

@@ -47,6 +47,8 @@ SUBMIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler
 EVERYWHERE = (-180.0, -90.0, 180.0, 90.0)
 LONGEST = 120.0
 """Seconds after which a run counts as hanging."""
+IDENTICAL = "identical"
+"""Verdict on a trial without faults."""
 KINDS = ("one worker", "all workers", "coordinator", "scheduler")
 Moment = Callable[["Command", Path], None]
 """Waits until it is time to kill; it is given the running command and its network."""
@@ -313,7 +315,7 @@ class Trial:
             "killed": self.kind, "after_s": self.moment, "found": self.version, "to_end_s": self.seconds,
             "coordinates_sigma": self.coordinates, "covariance": self.covariance,
             "answers": self.readings.answers, "versions_read": len(self.readings.versions),
-            "verdict": "; ".join(self.faults) or "identical",
+            "verdict": "; ".join(self.faults) or IDENTICAL,
         }  # fmt: skip
 
 

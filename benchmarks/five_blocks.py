@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import submin
 from benchmarks.bundle import solve
-from benchmarks.comparison import below, between, data, network_of, statement, verdict
+from benchmarks.comparison import below, between, data, network_of, rejections_allowed, statement, verdict, widened
 from orchestration.control import add_control
 from orchestration.executors import SerialExecutor
 from submin.accuracy import accuracy_against_truth, ce90, le90, nees_per_dof
@@ -187,7 +187,10 @@ def claims(steps: Sequence[Accuracy], networks: Networks) -> Iterator[dict[str, 
 
 
 def consistency(layout: Layout, scale: float) -> Iterator[dict[str, Any]]:
-    """Many realisations, each adjusted with its own errors: NEES, and how many errors lie within their CE90 and LE90."""
+    """Many realisations, each adjusted with its own errors: NEES, and how many errors lie within their CE90 and LE90.
+
+    The bands are those of 200 runs; of fewer they are wider.
+    """
     runs = max(round(RUNS * scale), 2)
     truth = geodetic_to_geocentric(layout.truth)
     axes = local_axes(layout.truth)
@@ -200,11 +203,13 @@ def consistency(layout: Layout, scale: float) -> Iterator[dict[str, Any]]:
         covariances.append(solution.local_covariance)
         lost += solution.rejected + solution.released
     pooled = accuracy_against_truth(np.concatenate(errors), np.concatenate(covariances))
-    of = f"{runs} runs"
-    yield between(f"NEES per degree of freedom, {of}", 0.97, 1.03, float(np.mean(nees)))
-    yield between(f"per cent within CE90, {of}", 87.0, 93.0, pooled.per_cent_within_ce90)
-    yield between(f"per cent within LE90, {of}", 87.0, 93.0, pooled.per_cent_within_le90)
-    yield below(f"good rays rejected and good cameras flagged, per cent of the rays, {of}", 0.1, 100.0 * lost / (runs * len(layout.image)))
+    of, rays = f"{runs} runs", runs * len(layout.image)
+    off, per_cent = widened(0.03, runs, RUNS), widened(3.0, runs, RUNS)
+    yield between(f"NEES per degree of freedom, {of}", 1.0 - off, 1.0 + off, float(np.mean(nees)))
+    for name, within in (("CE90", pooled.per_cent_within_ce90), ("LE90", pooled.per_cent_within_le90)):
+        yield between(f"per cent within {name}, {of}", 90.0 - per_cent, min(90.0 + per_cent, 100.0), within)
+    allowed = 100.0 * rejections_allowed(0.001, rays, runs, RUNS)
+    yield below(f"good rays rejected and good cameras flagged, per cent of the rays, {of}", allowed, 100.0 * lost / rays)
 
 
 def plot(steps: Sequence[Accuracy], control: Accuracy, out: Path) -> None:

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 import submin
 from benchmarks.bundle import Solution, solve
-from benchmarks.comparison import below, between, data, network_of, verdict
+from benchmarks.comparison import ONE_TILE_KM, below, between, data, network_of, rejections_allowed, verdict, widened
 from orchestration.control import add_control
 from orchestration.executors import SerialExecutor
+from submin import Network
 from submin.accuracy import accuracy_against_truth, ce90, le90, nees_band, nees_per_dof
 from submin.geodesy import geodetic_to_geocentric, local_axes, rotate_covariance
 from submin.query.control_set import ControlSet
@@ -38,6 +39,10 @@ Rows = NDArray[np.int32]
 RUNS = 20
 SEED = 0
 TILE_KM = 200.0
+TILED = (0, 1, 2)
+"""Seeds of which the network of one tile is compared with one of tiles of `TILE_KM`."""
+WITHIN = 5.0
+"""Half-width of the band about 90 for the per cent within CE90 and LE90, at full scale."""
 
 
 class Printed(NamedTuple):
@@ -81,7 +86,7 @@ class Networks:
     Attributes
     ----------
     pairs, cells, simultaneous : all points; one commit a block, one a cell, and one for all
-    one_block : all images in one block; tiled : tiles of `TILE_KM` instead of one
+    one_block : all images in one block
     sparse : pairs, with sparse control
     seconds : that each block took, adjusted, fused and committed
     """
@@ -90,9 +95,24 @@ class Networks:
     cells: ControlSet
     simultaneous: ControlSet
     one_block: ControlSet
-    tiled: ControlSet
     sparse: ControlSet
     seconds: Array
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """One tile against several, with one seed.
+
+    Attributes
+    ----------
+    judged_differently : cameras released and rays rejected by the one and not by the other
+    metres : largest difference of coordinates; of_ce90 : largest distance of a point as a part of its CE90
+    """
+
+    seed: int
+    judged_differently: tuple[str, ...]
+    metres: float
+    of_ce90: float
 
 
 def measure(scale: float, workers: int, out: Path | None = None) -> list[dict[str, Any]]:
@@ -101,6 +121,7 @@ def measure(scale: float, workers: int, out: Path | None = None) -> list[dict[st
     scene = realise(layout, SEED)
     with tempfile.TemporaryDirectory() as folder:
         networks = fuse(scene, Path(folder))
+        tilings = [tiling(realise(layout, seed), seed, Path(folder) / f"tiling-{seed}") for seed in TILED]
     runs = max(round(RUNS * scale), 1)
     predicted = predictions(layout, networks.pairs, networks.sparse, scene_blocks(scene))
     measured: dict[str, list[Errors]] = {name: [] for name in TABLES}
@@ -115,10 +136,12 @@ def measure(scale: float, workers: int, out: Path | None = None) -> list[dict[st
         plot(layout, networks, predicted, out)
     band = nees_band(runs * 3 * len(layout.check.points))
     rows = list(tables(predicted, measured))
-    rows += equivalence(networks)
+    rows += [*equivalence(networks), *tiles(tilings)]
+    rays = runs * len(layout.image)
+    allowed = 100.0 * rejections_allowed(0.001, rays, runs, RUNS)
     rows += [
         between(f"NEES per degree of freedom of the check points, {runs} runs", *band, float(np.mean(nees))),
-        below(f"good rays and cameras rejected, per cent of the rays, {runs} runs", 0.1, 100.0 * lost / (runs * len(layout.image))),
+        below(f"good rays and cameras rejected, per cent of the rays, {runs} runs", allowed, 100.0 * lost / rays),
         data("seconds a pair, adjusted, fused and committed", "paper, 2010: 60", float(networks.seconds.mean())),
         data("seconds of the slowest pair", "paper: not stated", float(networks.seconds.max())),
         data("minutes, all pairs", "paper, 2010: 60", float(networks.seconds.sum() / 60.0)),
@@ -154,7 +177,6 @@ def fuse(scene: SimulatedScene, folder: Path) -> Networks:
         cells=answer(network_of(catalogue, folder / "cells", by_cell.values())),
         simultaneous=answer(network_of(catalogue, folder / "simultaneous", [blocks])),
         one_block=answer(network_of(catalogue, folder / "one-block", [[joined(blocks, "everything")]])),
-        tiled=answer(network_of(catalogue, folder / "tiled", [blocks], TILE_KM)),
         sparse=answer(pairs),
         seconds=np.diff(marks),
     )
@@ -248,8 +270,12 @@ def nees_of(solution: Solution, scene: SimulatedScene) -> float:
 
 
 def tables(predicted: dict[str, tuple[float, float]], measured: dict[str, list[Errors]]) -> Iterator[dict[str, Any]]:
-    """Two rows for each line of the paper's tables: the paper's, and ours; percentiles are means over the realisations."""
+    """Two rows for each line of the paper's tables: the paper's, and ours; percentiles are means over the realisations.
+
+    The band for the per cent within CE90 and LE90 is that of the full number of realisations; of fewer it is wider.
+    """
     for name, lines in TABLES.items():
+        band = widened(WITHIN, len(measured[name]), RUNS)
         pooled = Errors.pooled(measured[name])
         overall = accuracy_against_truth(pooled.enu, pooled.covariance)
         runs = [accuracy_against_truth(errors.enu, errors.covariance) for errors in measured[name]]
@@ -257,7 +283,7 @@ def tables(predicted: dict[str, tuple[float, float]], measured: dict[str, list[E
             paper, ours = lines[k], predicted[name][k]
             percentiles = [float(np.mean([getattr(run, f"{direction}_{p}") for run in runs])) for p in ("p50", "p90", "p95")]
             within = overall.per_cent_within_le90 if k else overall.per_cent_within_ce90
-            met = abs(ours - paper.predicted) <= ALLOWED[name][k] * paper.predicted and 85.0 <= within <= 95.0
+            met = abs(ours - paper.predicted) <= ALLOWED[name][k] * paper.predicted and abs(within - 90.0) <= band
             for whose, values, word in (("paper", tuple(map(float, paper)), ""), ("ours", (*percentiles, ours, within), verdict(met))):
                 yield {
                     "table": name, "direction": direction, "whose": whose, "50 %": values[0], "90 %": values[1], "95 %": values[2],
@@ -271,7 +297,45 @@ def equivalence(networks: Networks) -> Iterator[dict[str, Any]]:
         yield below(f"pairs - {name}: coordinates, mm", 1e-6, 1e3 * _difference(networks.pairs, getattr(networks, name)))
     regrouped = 1e3 * _difference(networks.pairs, networks.one_block)
     yield data("pairs - all images as one block: coordinates, mm", "round-off; a last digit is 0.9e-6", regrouped)
-    yield below(f"one tile - tiles of {TILE_KM:g} km, rigorous: coordinates, mm", 1.0, 1e3 * _difference(networks.pairs, networks.tiled))
+
+
+def tiling(scene: SimulatedScene, seed: int, folder: Path) -> Tiling:
+    """One scene in one tile and in tiles of `TILE_KM`, all blocks in one commit."""
+    write_scene(scene, folder / "catalogue")
+    catalogue = Catalogue.open(folder / "catalogue")
+    blocks = list(catalogue.blocks())
+    one, other = (
+        submin.open(network_of(catalogue, folder / name, [blocks], side)) for name, side in (("one", ONE_TILE_KM), ("tiles", TILE_KM))
+    )
+    answers = [network.query(points=scene.layout.point_ids, policy="rigorous") for network in (one, other)]
+    apart = np.linalg.norm(answers[0].geocentric - answers[1].geocentric, axis=1)
+    return Tiling(seed, tuple(sorted(given_up(one) ^ given_up(other))), _difference(*answers), float((apart / answers[0].ce90).max()))
+
+
+def given_up(network: Network) -> frozenset[str]:
+    """Cameras that a network has released and rays that it has rejected."""
+    snapshot = network.snapshot
+    images = snapshot.images()
+    found = {image.image_id for image in images if image.released}
+    for cell in (snapshot.cell(number, with_sums=False) for number in snapshot.cell_numbers()):
+        for ray in np.flatnonzero(~cell.rays.accepted):
+            found.add(f"{cell.point_ids[cell.rays.point[ray]]} in {images[cell.images[cell.rays.image[ray]]].image_id}")
+    return frozenset(found)
+
+
+def tiles(tilings: Sequence[Tiling]) -> Iterator[dict[str, Any]]:
+    """Rows of one tile against several: coordinates where the judgement is the same, data where a tile judges otherwise (decision 003).
+
+    What is judged differently must leave every point within the CE90 that is stated for it.
+    """
+    name = f"one tile - tiles of {TILE_KM:g} km, rigorous"
+    alike = [tiling.metres for tiling in tilings if not tiling.judged_differently]
+    yield below(f"{name}, judged alike ({len(alike)} of {len(tilings)} seeds): coordinates, mm", 1.0, 1e3 * max(alike, default=np.inf))
+    for tiling in tilings:
+        if tiling.judged_differently:
+            otherwise = f"judged differently: {', '.join(tiling.judged_differently)}"
+            yield data(f"{name}, seed {tiling.seed}: coordinates, mm", otherwise, 1e3 * tiling.metres)
+            yield below(f"{name}, seed {tiling.seed}: part of the stated CE90", 1.0, tiling.of_ce90)
 
 
 def plot(layout: Layout, networks: Networks, predicted: dict[str, tuple[float, float]], out: Path) -> None:
@@ -288,7 +352,7 @@ def plot(layout: Layout, networks: Networks, predicted: dict[str, tuple[float, f
     chart.plot(control[:, 0], control[:, 1], "^", color="tab:red", ms=7, label="sparse control (Table 6)")
     chart.set(xlabel="longitude, degrees", ylabel="latitude, degrees", aspect=1.0 / np.cos(np.radians(37.0)))
     chart.set_title("CE90 of the fused points, m (simulated)")
-    chart.legend(loc="lower right")
+    chart.legend(loc="upper right")
     figure.colorbar(points, ax=chart, shrink=0.7)
     place = np.arange(len(TABLES))
     for k, (name, colour) in enumerate((("CE", "tab:blue"), ("LE", "tab:orange"))):

@@ -13,6 +13,7 @@ from submin import ControlSet, Network
 from submin.accuracy import AccuracyTable, accuracy_against_truth, nees_band, nees_per_dof
 from submin.errors import InputError
 from submin.geodesy import geodetic_to_geocentric, local_axes
+from submin.storage.ledger import Ledger
 from submin.storage.point_table import PointTable
 
 Array = NDArray[np.float64]
@@ -30,6 +31,7 @@ class CheckResult:
     accuracy : of all points; by_area : of each named sub-area
     nees_per_dof : mean over the groups, weighted by their degrees of freedom; nees_band : its 99 % band if the model is right
     missing : check points that the network cannot answer for
+    control_left_out : check points that are the network's control: a surveyed point cannot check what was fitted to it
     policy, version : of the answers
     """
 
@@ -38,6 +40,7 @@ class CheckResult:
     nees_per_dof: float
     nees_band: tuple[float, float]
     missing: int
+    control_left_out: int
     policy: str
     version: str
 
@@ -48,21 +51,29 @@ class CheckResult:
             "nees_band": list(self.nees_band),
             "areas": {name: table.to_mapping() for name, table in self.by_area.items()},
             "missing": self.missing,
+            "control_left_out": self.control_left_out,
             "policy": self.policy,
             "version": self.version,
         }
 
 
 def check(network: Network, points: PointTable, policy: str, advance: Callable[[int], None] = lambda done: None) -> CheckResult:
-    """Compare the network with check points of the same ids.
+    """Compare the network with check points of the same ids; those that are its control are left out, and counted.
 
     Raises
     ------
     InputError
-        When the network holds none of the check points.
+        When the network holds none of the check points, or all are its control.
     """
     order = np.argsort(points.point_ids)
+    controlled = np.isin(points.point_ids[order], Ledger.of(network.snapshot).control_points())
+    order = order[~controlled]
     ids = points.point_ids[order]
+    if controlled.any() and not len(ids):
+        raise InputError(
+            f"all {len(controlled)} check points are control of the network ({points.point_ids[0]}, ...), which cannot check itself; "
+            "expected points that did not control it: withdraw some of the control, or take another table"
+        )
     errors, covariances, rows = [], [], []
     nees, dof = 0.0, 0
     for control in _groups(network, ids, policy):
@@ -88,7 +99,7 @@ def check(network: Network, points: PointTable, policy: str, advance: Callable[[
     return CheckResult(
         accuracy_against_truth(enu, covariance),
         {name: accuracy_against_truth(enu[areas == name], covariance[areas == name]) for name in named},
-        nees / dof, nees_band(dof), len(ids) - len(row), policy, network.version,
+        nees / dof, nees_band(dof), len(ids) - len(row), int(controlled.sum()), policy, network.version,
     )  # fmt: skip
 
 

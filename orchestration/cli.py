@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from orchestration.stopping import Stopped, signals_stop
@@ -531,17 +532,18 @@ def check(
     output: Annotated[Path | None, typer.Option("--out", help="Text file that takes the table too.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare a network with check points: errors, stated accuracy, per cent within it, NEES.
+    """Compare a network with check points: errors, stated accuracy, per cent within it, NEES. Its own control is left out.
 
     Example: submin check network catalogue/check.parquet
     """
     import submin
     from orchestration.check import check as compare
+    from orchestration.text_tables import as_wide_as
     from submin.formats.replacing import replacing
     from submin.storage.point_table import read_point_table
 
     result = compare(submin.open(network), read_point_table(points), policy)
-    table = Table(title=f"{network} {result.version} against {points.name}, policy {policy}", title_justify="left")
+    table = Table(title=escape(f"{network} {result.version} against {points.name}, policy {policy}"), title_justify="left")
     headings = ("area", "points", "hor. 50 %", "90 %", "95 %", "mean CE90", "within", "vert. 50 %", "90 %", "95 %", "mean LE90", "within")
     for heading in headings:
         table.add_column(heading, justify="left" if heading == "area" else "right", no_wrap=True)
@@ -549,21 +551,24 @@ def check(
         lengths = (f"{v:.2f} m" for v in (a.horizontal_p50, a.horizontal_p90, a.horizontal_p95, a.mean_ce90))
         heights = (f"{v:.2f} m" for v in (a.vertical_p50, a.vertical_p90, a.vertical_p95, a.mean_le90))
         table.add_row(
-            name, f"{a.points:,}", *lengths, f"{a.per_cent_within_ce90:.1f} %", *heights, f"{a.per_cent_within_le90:.1f} %"
+            escape(name), f"{a.points:,}", *lengths, f"{a.per_cent_within_ce90:.1f} %", *heights, f"{a.per_cent_within_le90:.1f} %"
         )  # fmt: skip
     closing = (
         f"NEES per degree of freedom {result.nees_per_dof:.4f} (99 % band {result.nees_band[0]:.4f} to {result.nees_band[1]:.4f} "
         f"when the stated covariance is exact); {result.missing} check points are not determined in the network"
     )
+    if result.control_left_out:
+        closing += f"; {result.control_left_out} are control of the network, which cannot check itself, and were left out"
+    width = as_wide_as(table)
     if output is not None:
         with replacing(output) as temporary, temporary.open("w", encoding="utf-8") as stream:
-            plain = Console(file=stream, width=160)
+            plain = Console(file=stream, width=width)
             plain.print(table)
             plain.print(closing, soft_wrap=True)
     if as_json:
         show(result.to_json(), True, "")
     else:
-        wide = Console(highlight=False, width=max(out.width, 132))
+        wide = Console(highlight=False, width=width)
         wide.print(table)
         wide.print(closing, soft_wrap=True)
 

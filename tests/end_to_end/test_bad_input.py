@@ -32,6 +32,7 @@ from networks import accepted_rays, area_of
 import submin
 from orchestration.adjust import adjust, write
 from orchestration.cli import main
+from orchestration.control import add_control
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.run import run
@@ -39,6 +40,7 @@ from submin.adjustment.warm_up import compile_kernels
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.network_store import Snapshot, tag_version, versions
+from submin.storage.point_table import read_point_table
 from submin.storage.simulated import write_region
 
 ROOT = Path(__file__).parents[2]
@@ -111,6 +113,12 @@ class World:
         """The catalogue is in, and its version has the tag ``mine``."""
         tag_version(str(self.fused), "mine")
         return self.fused
+
+    def controlling(self) -> Path:
+        """A table of control that is in the network, with its covariance as sigmas."""
+        path = self.write("survey.csv", f"{','.join(POINT | SIGMAS)}\nP00000,100,35,900,9000,9000,9000\n")
+        add_control(read_point_table(path), "survey", str(self.fused), SerialExecutor())
+        return path
 
     @property
     def new(self) -> Path:

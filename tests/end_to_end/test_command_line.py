@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from networks import rewrite
 
@@ -149,6 +151,35 @@ def test_the_papers_experiments(shell: Shell, tmp_path: Path) -> None:
     assert shell.json("control", "add", network, catalogue / "control-external.parquet")["control_fused"] == 4
     after = shell.json("check", network, catalogue / "check.parquet")
     assert after["horizontal"]["mean_ce90"] < 0.5 * before["horizontal"]["mean_ce90"]
+    # what has become control does not check itself
+    assert (before["control_left_out"], after["control_left_out"]) == (0, 4)
+    assert (before["points"], after["points"], after["missing"]) == (62, 58, 0)
+    assert sorted(after["areas"]) == [f"block {k}" for k in range(1, 5)]  # the points of block 5 alone are the control
+    _, err = shell("check", network, catalogue / "control-external.parquet", code=2)
+    assert "all 4 check points are control of the network" in err
+    # no terminal, and areas with long names: nothing is cut off
+    points = Catalogue.open(catalogue).points("check")
+    assert points is not None
+    long = "[a] " + "block " * 20
+    pq.write_table(
+        pa.table({
+            "point_id": points.point_ids, "longitude": points.geodetic[:, 0], "latitude": points.geodetic[:, 1],
+            "height": points.geodetic[:, 2], **dict.fromkeys(("sigma_e", "sigma_n", "sigma_u"), np.zeros(62)), "area": [long.strip()] * 62,
+        }),
+        tmp_path / "long.parquet",
+    )  # fmt: skip
+    out, _ = shell("check", network, tmp_path / "long.parquet", "--out", tmp_path / "long.txt")
+    assert "4 are control of the network" in out
+    for said in (out, (tmp_path / "long.txt").read_text(encoding="utf-8")):
+        assert "…" not in said and long.strip() in said
+        (row,) = (line for line in said.splitlines() if long.strip() in line)
+        for value in (
+            after["horizontal"]["p95"],
+            after["horizontal"]["mean_ce90"],
+            after["vertical"]["p50"],
+            after["vertical"]["mean_le90"],
+        ):
+            assert f" {value:.2f} m" in row
 
     made = shell.json("simulate", "worldview", "--out", tmp_path / "worldview", "--seed", 5)
     assert (made["images"], made["blocks"], made["points"], made["check_points"]) == (100, 49, 1347, 101)

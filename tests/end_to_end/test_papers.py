@@ -5,15 +5,19 @@ Predicted accuracies depend on the layout, hardly on the errors that are drawn: 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 import submin
+from benchmarks import __main__ as main
 from benchmarks import five_blocks, worldview
 from benchmarks.bundle import solve
-from benchmarks.comparison import MET, network_of
+from benchmarks.comparison import DATA, MET, NOT_MET, network_of, rejections_allowed, widened
 from orchestration.check import check
 from orchestration.control import add_control
 from orchestration.executors import SerialExecutor
@@ -102,3 +106,29 @@ def test_pair_cell_and_simultaneous_are_one(pairs: tuple[SimulatedScene, Catalog
     }
     for name, limit_mm in (("cells", 1e-6), ("simultaneous", 1e-6), ("one block", 1e-4)):
         assert 1e3 * np.abs(answers["pairs"].geocentric - answers[name].geocentric).max() <= limit_mm
+
+
+def test_tiles_that_judge_alike_must_agree_and_others_stay_within_what_is_stated() -> None:
+    alike = worldview.Tiling(1, (), 1.2e-5, 4e-6)
+    otherwise = worldview.Tiling(0, ("image 3",), 0.86, 0.5)
+    assert [row["verdict"] for row in worldview.tiles([alike, otherwise])] == [MET, DATA, MET]
+    assert [row["verdict"] for row in worldview.tiles([replace(alike, metres=0.002)])] == [NOT_MET]
+    assert [row["verdict"] for row in worldview.tiles([replace(otherwise, of_ce90=1.1)])] == [NOT_MET, DATA, NOT_MET]  # none is alike
+
+
+def test_bands_fit_the_number_of_runs() -> None:
+    assert (widened(3.0, 200, 200), widened(3.0, 400, 200), widened(3.0, 50, 200)) == (3.0, 3.0, 6.0)
+    assert rejections_allowed(0.001, 48000, 200, 200) == 0.001
+    assert rejections_allowed(0.001, 480, 2, 200) == 4 / 480  # of half a ray expected, four are one in a thousand at most
+    assert rejections_allowed(0.001, 480, 2, 200) < 0.01
+
+
+def test_what_is_not_met_ends_with_exit_code_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    for verdict, code in ((MET, 0), (DATA, 0), ("", 0), (NOT_MET, 1)):
+        rows = [{"claim": "a claim " * 40, "verdict": verdict}]
+        monkeypatch.setitem(main.BENCHMARKS, "worldview", ("", lambda scale, workers, rows=rows: rows))
+        app = typer.Typer()
+        app.command()(main.command)
+        said = CliRunner().invoke(app, ["worldview"])
+        assert said.exit_code == code
+        assert ("a claim " * 40).strip() in said.output and "…" not in said.output
