@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from submin.adjustment.adjustment import Adjustment, adjust
 from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
-from submin.adjustment.intersection import intersect
+from submin.adjustment.intersection import blind_image, intersect
 from submin.adjustment.rays import sorted_rays
-from submin.adjustment.status import Cause
+from submin.adjustment.status import Cause, Status
 from submin.errors import SubminError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
@@ -123,13 +123,10 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
         order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
         rays = sorted_rays(point.astype(np.int32), block.image, block.observed, block.sigma, accepted)
         start = intersect(images, rays, len(ids))
-        lost = ~np.isfinite(start.geocentric).all(axis=1)
-        if lost.any():
-            image = block.images[int(rays.image[rays.first(len(ids))[:-1][lost][0]])].image_id
-            return BlockAdjustment(
-                block.block_id, accepted,
-                f"image {image}: its camera does not reach the ground at point {ids[lost][0]}; check the camera model and the axis order",
-            )  # fmt: skip
+        lost = np.flatnonzero(~np.isfinite(start.geocentric).all(axis=1))
+        blind = (int(rays.image[np.searchsorted(rays.point, lost[0])]), int(lost[0])) if len(lost) else blind_image(images, rays)
+        if blind is not None:
+            return BlockAdjustment(block.block_id, accepted, Status(Cause.UNSEEN, False, 0, *blind).message(images.ids, ids))
         if np.bincount(rays.point).max() < 2:
             return BlockAdjustment(block.block_id, accepted, None)
         result = adjust(images, rays, start.geocentric)

@@ -113,3 +113,20 @@ def intersect(images: ImageSet, rays: Rays, points: int) -> Intersection:
             break
     ground[~reached] = np.nan
     return Intersection(ground, misfit)
+
+
+def blind_image(images: ImageSet, rays: Rays) -> tuple[int, int] | None:
+    """An image none of whose rays reaches the ground at its camera's mean height, and the first point that it measures; None without any.
+
+    Almost always the first ray of each image tells.
+    """
+    seen, at = np.unique(rays.image, return_index=True)
+    for image, first in zip(seen.tolist(), at.tolist(), strict=True):
+        rows = np.flatnonzero(rays.image == image) if _blind(images, rays, np.array([first])) else np.array([first])
+        if _blind(images, rays, rows):
+            return image, int(rays.point[first])
+    return None
+
+
+def _blind(images: ImageSet, rays: Rays, rows: NDArray[np.int64]) -> bool:
+    return not bool(np.isfinite(images.localise(rays.image[rows], rays.observed[rows])).all(axis=1).any())

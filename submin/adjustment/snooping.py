@@ -218,7 +218,10 @@ def _predicted(inner: Array, e: Array, cross: Array, inner2: Array, e2: Array, f
                 mean[i, 0] += turned[i, d] * part / value
                 for k in range(free):
                     spread[i, k] += turned[i, d] * turned[k, d] / value
-    inverse = np.linalg.inv(spread)
+    values, vectors = np.linalg.eigh(spread)
+    for d in range(free):
+        values[d] = max(values[d], 1.0)  # C >= I: what is less is round-off
+    inverse = (vectors / values) @ vectors.T
     solved = inverse @ mean
     for i in range(free):
         e[i] = solved[i, 0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from typing import Any
@@ -27,6 +27,8 @@ Index = NDArray[np.int32]
 Ids = NDArray[np.str_]
 
 FORMAT_VERSION = 1
+FAR_OUTSIDE = 10.0
+"""Measurements farther from the middle of their image than so many times its size are none of it."""
 LEAST_RAYS = 3
 """A block with fewer rays ties nothing to anything: more likely a table cut short than a block."""
 DEFAULT_SIGMA_PX = 0.5
@@ -309,6 +311,14 @@ def defects(block: Block) -> str | None:
         if bad.any():
             r = int(np.argmax(bad))
             return f"{ray(r)}: {name} is {values[r]}; expected a finite number of pixels"
+    for name, sizes in (("sample", [i.width for i in block.images]), ("line", [i.height for i in block.images])):
+        first, size = _first_pixels(block.images, name)[block.image], np.array(sizes, dtype=np.float64)[block.image]
+        bad = np.abs(getattr(block, name) - first - 0.5 * size) > FAR_OUTSIDE * size
+        if bad.any():
+            r = int(np.argmax(bad))
+            least, most = first[r], first[r] + size[r] - 1.0
+            found = getattr(block, name)[r]
+            return f"{ray(r)}: {name} is {found:g}; expected one of the image ({least:g} to {most:g}), or a little outside it"
     for name in ("sigma_sample", "sigma_line"):
         values = getattr(block, name)
         bad = values <= 0.0
@@ -331,6 +341,12 @@ def defects(block: Block) -> str | None:
             if model.sigma > 0.0 and model.correlation in ("exponential", "gaussian"):
                 return f"image {image.image_id} has no time; the {model.correlation} correlation of the priors needs column 'acquired'"
     return None
+
+
+def _first_pixels(images: Sequence[ImageRecord], name: str) -> Array:
+    """Sample or line (m,) of the first pixel of each image: of an RPC, in the pixel frame that it states."""
+    cameras = [json.loads(image.camera) if image.sensor == "rpc" else {} for image in images]
+    return np.array([float(camera.get("origin", (0.0, 0.0))[name == "line"]) for camera in cameras])
 
 
 def first_repeated(point: NDArray[np.integer], image: NDArray[np.integer]) -> tuple[int, int] | None:
