@@ -19,7 +19,7 @@ demo: environment
 	$(BIN)/submin map $(DEMO)/network --out $(DEMO)/network.png
 
 test: check
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 check: environment
 	$(BIN)/ruff check .

@@ -41,6 +41,7 @@ from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.network_store import Snapshot, tag_version, versions
 from submin.storage.point_table import read_point_table
+from submin.storage.rpc_import import import_rpc
 from submin.storage.simulated import write_region
 
 ROOT = Path(__file__).parents[2]
@@ -1029,8 +1030,11 @@ def _(w: World) -> list[Any]:
 
 @case("catalogue made on a full disk")
 def _(w: World) -> list[Any]:
+    words = w.importing()
+    import_rpc(words[3], words[5], words[7], w.folder / "roomy")  # what is compiled is kept on disk: that it has room for
+    shutil.rmtree(w.folder / "roomy")
     w.around = lambda: limited(1000)
-    return w.importing()
+    return words
 
 
 @case("catalogue made in a folder that is read only")
