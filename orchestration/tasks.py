@@ -17,7 +17,7 @@ from submin.adjustment.adjustment import Adjustment, adjust
 from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import blind_image, intersect
-from submin.adjustment.rays import sorted_rays
+from submin.adjustment.rays import Rays
 from submin.adjustment.status import Cause, Status
 from submin.errors import SubminError
 from submin.geodesy import Ellipsoid
@@ -121,7 +121,7 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
         images = image_set(block.images, ellipsoid, width_of(image.sensor for image in block.images))
         ids, point = np.unique(block.point_ids, return_inverse=True)
         order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
-        rays = sorted_rays(point.astype(np.int32), block.image, block.observed, block.sigma, accepted)
+        rays = Rays(point[order].astype(np.int32), block.image[order], block.observed[order], block.sigma[order], accepted)
         start = intersect(images, rays, len(ids))
         lost = np.flatnonzero(~np.isfinite(start.geocentric).all(axis=1))
         blind = (int(rays.image[np.searchsorted(rays.point, lost[0])]), int(lost[0])) if len(lost) else blind_image(images, rays)

@@ -93,7 +93,7 @@ def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, 
     """
     ground = images.ground(linearised_at)
     seen = images.project(theta, ground, rays.image, rays.point, rays.observed)
-    # the projection is nobody else's: its arrays become those of the rays
+    # the arrays of the projection become those of the rays
     y = _whiten(
         seen.image, seen.by_ground, seen.by_parameters, rays.observed, rays.sigma, rays.image, rays.point, theta, linearised_at - origin
     )
@@ -176,7 +176,7 @@ def _eliminate(
     return misclosure, redundancy
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _point_factors(
     first: Offsets, weight: Array, by_ground: Array, by_parameters: Array, y: Array
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
