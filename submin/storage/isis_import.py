@@ -354,10 +354,14 @@ def _reductions(
 
 
 def _scale(rays: _Rays, places: Array, listed: Sequence[_Listed], heights: Array) -> float | None:
-    """Scale of points projected at the detector's full resolution against the measures, about each image's centroid; None without any."""
+    """Scale of points projected at the detector's full resolution against the measures, about each image's centroid; None without any.
+
+    Images of which the reduction is listed have no say in that of the others.
+    """
     cameras = [i.camera.description(i.size, 1.0, float(h)) for i, h in zip(listed, heights, strict=True)]
     full = _project(np.stack([sensor_named("frame").pack(c, *i.size) for c, i in zip(cameras, listed, strict=True)]), rays, places, listed)
-    seen = np.isfinite(full).all(axis=1)
+    unlisted = np.array([image.reduction is None for image in listed])
+    seen = np.isfinite(full).all(axis=1) & unlisted[rays.image]
     spreads = []
     for values in (full[seen], rays.observed[seen]):
         image = rays.image[seen]
