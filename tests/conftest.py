@@ -6,10 +6,15 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 # One BLAS thread, as every worker has: matrices are small here, and two threads on two busy cores wait for each other.
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
+
+# How long an example takes is not what these tests are about, and machines are busy.
+settings.register_profile("submin", deadline=None)
+settings.load_profile("submin")
 
 ROOT = Path(__file__).parents[1]
 
