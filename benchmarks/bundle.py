@@ -71,7 +71,7 @@ def solve(blocks: Iterable[Block], judged: bool = True) -> Solution:
     observed = np.concatenate([np.column_stack([block.sample, block.line]) for block in blocks])
     sigma = np.concatenate([np.column_stack([block.sigma_sample, block.sigma_line]) for block in blocks])
     rays = sorted_rays(point.astype(np.int32), image, observed, sigma, np.ones(len(image), dtype=np.bool_))
-    origin = intersect(images, rays, len(ids)).geocentric
+    origin = intersect(images, rays, len(ids))
     accepted, released = rays.accepted, np.zeros(len(images), dtype=np.bool_)
     if judged:
         adjusted = adjust(images, rays, origin)

@@ -41,7 +41,7 @@ def measure(scale: float, workers: int) -> list[dict[str, Any]]:
         np.column_stack([region.sigma_sample, region.sigma_line]), np.ones(len(region.point), dtype=np.bool_),
     )  # fmt: skip
     points, count = len(region.point_ids), len(rays)
-    start = intersect(images, rays, points).geocentric
+    start = intersect(images, rays, points)
     theta = np.zeros((len(images), images.parameters))
     linear = linearise(images, rays, theta, start, start)
     weight = np.ones(count)

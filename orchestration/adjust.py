@@ -167,7 +167,7 @@ def _judged(block: Block, catalogue: Catalogue, network: str | None, version: st
     ids, point = np.unique(block.point_ids, return_inverse=True)
     observed, sigma = np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line])
     rays = sorted_rays(point.astype(np.int32), block.image, observed, sigma, outcome.accepted)
-    return _Judged(block, images, ids, rays, intersect(images, rays, len(ids)).geocentric)
+    return _Judged(block, images, ids, rays, intersect(images, rays, len(ids)))
 
 
 def _refuse_known(block: Block, ledger: Ledger, network: str) -> None:

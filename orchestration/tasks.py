@@ -123,13 +123,13 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
         order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
         rays = Rays(point[order].astype(np.int32), block.image[order], block.observed[order], block.sigma[order], accepted)
         start = intersect(images, rays, len(ids))
-        lost = np.flatnonzero(~np.isfinite(start.geocentric).all(axis=1))
+        lost = np.flatnonzero(~np.isfinite(start).all(axis=1))
         blind = (int(rays.image[np.searchsorted(rays.point, lost[0])]), int(lost[0])) if len(lost) else blind_image(images, rays)
         if blind is not None:
             return BlockAdjustment(block.block_id, accepted, Status(Cause.UNSEEN, False, 0, *blind).message(images.ids, ids))
         if np.bincount(rays.point).max() < 2:
             return BlockAdjustment(block.block_id, accepted, None)
-        result = adjust(images, rays, start.geocentric)
+        result = adjust(images, rays, start)
         if result.status.cause is not Cause.CONVERGED:
             return BlockAdjustment(block.block_id, accepted, result.status.message(images.ids, ids))
         accepted[order] = result.accepted

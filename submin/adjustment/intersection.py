@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +16,6 @@ Offsets = NDArray[np.int64]
 HEIGHT_SIGMA = 2000.0
 """Metres. A hold on the mean height, loose enough not to matter where rays converge, that keeps parallel rays from running away."""
 ITERATIONS = 8
-
-
-@dataclass(frozen=True)
-class Intersection:
-    """Approximate positions.
-
-    Attributes
-    ----------
-    geocentric : (n, 3), metres; NaN where a point's camera does not reach the ground
-    misfit : (r,) metres by which each ray passes its point, unadjusted cameras
-    """
-
-    geocentric: Array
-    misfit: Array
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -85,8 +69,10 @@ def _cut(images: ImageSet, rays: Rays, first: Offsets) -> Array:
     return start
 
 
-def intersect(images: ImageSet, rays: Rays, points: int) -> Intersection:
-    """Intersect the rays of each of ``points`` points; a single ray is cut at its camera's mean height.
+def intersect(images: ImageSet, rays: Rays, points: int) -> Array:
+    """Where the rays of each of ``points`` points meet, geocentric (n, 3), metres; NaN where no camera of a point reaches the ground.
+
+    A single ray is cut at its camera's mean height.
 
     Every point must have at least one ray. Rays that were rejected count too: registration comes before any judgement.
     """
@@ -99,20 +85,17 @@ def intersect(images: ImageSet, rays: Rays, points: int) -> Intersection:
     up[~reached] = 0.0
     held = ground.copy()
     theta = np.zeros((len(images), images.parameters))
-    misfit = np.zeros(len(rays))
     moving = reached.copy()
     for _ in range(ITERATIONS):
         projection = images.project(theta, images.ground(ground), rays.image, rays.point)
         step = _steps(first, projection.image, projection.by_ground, rays.observed, rays.sigma, up / HEIGHT_SIGMA, held - ground)
         step[~(np.isfinite(step).all(axis=1) & moving)] = 0.0  # each point stops by itself: its company must not matter
         ground = ground + step
-        pixel = np.linalg.norm(projection.by_ground, axis=(1, 2)) / np.sqrt(2.0)
-        misfit = np.linalg.norm(rays.observed - projection.image, axis=1) / pixel
         moving &= np.abs(step).max(axis=1) >= 1e-3
         if not moving.any():
             break
     ground[~reached] = np.nan
-    return Intersection(ground, misfit)
+    return ground
 
 
 def blind_image(images: ImageSet, rays: Rays) -> tuple[int, int] | None:

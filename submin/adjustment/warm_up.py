@@ -30,4 +30,4 @@ def compile_kernels() -> None:
     observed = np.array([[10.0, 20.0], [10.5, 20.0], [90.0, 70.0], [90.0, 71.0]])
     image = np.array([0, 1, 0, 1], dtype=np.int32)
     rays = sorted_rays(index, image, observed, np.full((4, 2), 0.5), np.ones(4, dtype=np.bool_))
-    adjust(images, rays, intersect(images, rays, 2).geocentric)
+    adjust(images, rays, intersect(images, rays, 2))

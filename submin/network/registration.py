@@ -107,7 +107,7 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     local = rank[np.searchsorted(image_rows, rays.image)]
 
     every = np.ones(len(rays), dtype=np.bool_)
-    origin = intersect(images, sorted_rays(point.astype(np.int32), local, rays.observed, rays.sigma, every), len(ids)).geocentric
+    origin = intersect(images, sorted_rays(point.astype(np.int32), local, rays.observed, rays.sigma, every), len(ids))
     reached: Flags = np.asarray(np.isfinite(origin).all(axis=1))
     at = np.full(len(ids), -1, dtype=np.int64)
     outside: Flags = np.zeros(len(ids), dtype=np.bool_)

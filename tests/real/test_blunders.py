@@ -48,7 +48,7 @@ class Triplet:
     points: int
 
     def adjusted(self, rays: Rays) -> Adjustment:
-        return adjust(self.images, rays, intersect(self.images, rays, self.points).geocentric)
+        return adjust(self.images, rays, intersect(self.images, rays, self.points))
 
     @cached_property
     def clean(self) -> Adjustment:

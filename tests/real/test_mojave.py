@@ -202,7 +202,7 @@ def test_an_adjusted_pair_is_as_accurate_as_it_says(pair: list[Compared]) -> Non
         theta = np.asarray(images.prior @ rng.normal(size=images.prior.shape[1])).reshape(2, 6)
         observed = images.project(theta, images.ground(truth), image, point).image + rng.normal(0.0, 1.0, (2 * points, 2))
         rays = sorted_rays(point, image, observed, np.ones_like(observed), np.ones(2 * points, dtype=np.bool_))
-        result = adjust(images, rays, intersect(images, rays, points).geocentric)
+        result = adjust(images, rays, intersect(images, rays, points))
         assert result.converged and result.accepted.all() and not result.released.any()
         linear = linearise(images, rays, result.theta, result.ground, result.ground)
         weight = np.ones(len(rays))

@@ -160,7 +160,7 @@ def test_two_images_of_one_viewpoint_give_no_nonsense(apart: float) -> None:
     result = adjusted(block)
     assert finite(result)
     assert result.converged, named(block, result)
-    start = intersect(block.images, block.rays, len(block.ground)).geocentric
+    start = intersect(block.images, block.rays, len(block.ground))
     assert np.linalg.norm(result.ground - start, axis=1).max() < adjustment.REACH_METRES + 1.0
 
 

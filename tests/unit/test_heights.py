@@ -37,7 +37,7 @@ def test_points_of_one_viewpoint_get_their_height_from_the_surface() -> None:
     true = level + slope * (geodetic[:, 0] - middle)
     block = simulate_at(block, np.column_stack([geodetic[:, :2], true]))
     prior = HeightPrior(lambda longitude, latitude: level + slope * (longitude - middle), 2.0)
-    start = intersect(block.images, block.rays, len(block.ground)).geocentric
+    start = intersect(block.images, block.rays, len(block.ground))
     images, rays, result = adjust_with_heights(block.images, block.rays, start, prior)
     assert result.converged and result.accepted.all()
     error = (local_axes(geodetic) @ (result.ground - block.ground)[:, :, None])[:, :, 0]
@@ -61,7 +61,7 @@ def simulate_at(block: Simulated, geodetic: Array) -> Simulated:
 
 def test_a_height_is_one_observation_along_the_vertical() -> None:
     block = simulate(2, points=25)
-    start = intersect(block.images, block.rays, len(block.ground)).geocentric
+    start = intersect(block.images, block.rays, len(block.ground))
     images, rays, result = adjust_with_heights(block.images, block.rays, start, constant_height(500.0, 300.0))
     assert result.accepted.all()
     found = quality(images, rays, result)

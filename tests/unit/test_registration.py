@@ -222,7 +222,7 @@ def positions(ids: Sequence[str], ground: Array, images: Sequence[int]) -> Array
     image = np.array([by_name.index(int(row) - ROW) for row in rays.image], dtype=np.int32)
     point = np.tile(np.arange(len(ids), dtype=np.int32), len(images))
     bundle = sorted_rays(point, image, rays.observed, rays.sigma, np.ones(len(rays), dtype=np.bool_))
-    return intersect(IMAGES.take(by_name), bundle, len(ids)).geocentric
+    return intersect(IMAGES.take(by_name), bundle, len(ids))
 
 
 def cell_at(geocentric: Array) -> int:

@@ -61,7 +61,7 @@ def case() -> Case:
         np.stack([region.sigma_sample, region.sigma_line], axis=1), np.ones(len(region.image), dtype=np.bool_),
     )  # fmt: skip
     size = np.array([(i.width, i.height) for i in region.images], dtype=np.float64)
-    return Case(region, images, rays, intersect(images, rays, len(region.point_ids)).geocentric, np.zeros_like(size), size)
+    return Case(region, images, rays, intersect(images, rays, len(region.point_ids)), np.zeros_like(size), size)
 
 
 def test_points_lie_at_the_centres_of_a_grid_and_are_seen_there(case: Case) -> None:
