@@ -30,17 +30,21 @@ def measure(scale: float, workers: int) -> list[dict[str, Any]]:
     rows = [_row("project rpc with all partials", rays, "rays", _best(_projection(region, rays), 10), "2,000,000 rays/s")]
     blocks = {points: _block(triplet(points)) for points in POINTS}
     seconds = {points: _best(lambda block=block: _checked(block), 30) for points, block in blocks.items()}  # type: ignore[misc]
+    clean = _block(triplet(1000, blunder_rate=0.0))
+    what = "a triplet of 1,000 points without blunders through stage 1"
+    rows.append(_row(what, len(clean.image), "rays", _best(lambda: _checked(clean), 30), "15 ms"))
     for points in POINTS:
         asked = {10: "2 ms: overhead outside the kernels", 1000: "15 ms"}.get(points, "linear in rays")
         rows.append(_row(f"a triplet of {points:,} points through stage 1", len(blocks[points].image), "rays", seconds[points], asked))
     return rows
 
 
-def triplet(points: int) -> SimulatedRegion:
-    """One simulated three-line scene with about so many points, blunders among their rays."""
+def triplet(points: int, blunder_rate: float = 0.002) -> SimulatedRegion:
+    """One simulated three-line scene with about so many points, and blunders among their rays."""
     spacing = SCENE_KM / np.sqrt(points)
     return simulate_region(
-        RegionDesign(width_km=SCENE_KM, height_km=SCENE_KM, strips=1, point_spacing_km=float(spacing), bad_cameras=0)
+        RegionDesign(width_km=SCENE_KM, height_km=SCENE_KM, strips=1, point_spacing_km=float(spacing), bad_cameras=0,
+                     blunder_rate=blunder_rate)
     )  # fmt: skip
 
 
