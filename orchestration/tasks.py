@@ -130,7 +130,7 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
         if np.bincount(rays.point).max() < 2:
             return BlockAdjustment(block.block_id, accepted, None)
         result = adjust(images, rays, start)
-        if result.status.cause is not Cause.CONVERGED:
+        if result.status.cause not in (Cause.CONVERGED, Cause.FEW_AGREE):  # that few agree is told from the rays, settled or not
             return BlockAdjustment(block.block_id, accepted, result.status.message(images.ids, ids))
         accepted[order] = result.accepted
         return BlockAdjustment(block.block_id, accepted, None)

@@ -288,6 +288,8 @@ def _adrift(rays: Rays, weight: Array, distance: Array, reach: Array) -> int | N
     Cameras known to metres are linear as far as points may run along weak rays. Others are not: what a linearisation so far from the
     solution says of its accuracy is not true.
     """
+    if 2 * np.count_nonzero(weight) < np.count_nonzero(rays.accepted):
+        return None  # rays that contradict each other are another cause
     used = np.bincount(rays.point[weight > 0.0], minlength=len(distance)) >= 2
     held = used & (reach > REACH_METRES) & (distance > (1.0 - 1e-9) * reach)
     return int(np.argmax(held)) if 2 * np.count_nonzero(held) > np.count_nonzero(used) else None
