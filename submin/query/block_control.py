@@ -19,7 +19,7 @@ from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.network.cell import Cell, widened_sums
 from submin.network.sub_min import GroundPart, SubMin, add_sums, factor, loadings, locate
-from submin.query.planner import POLICIES, Selection, check_policy, choose, ground_part, points_named, well_spread
+from submin.query.planner import POLICIES, check_policy, choose, determined_parts, points_named, well_spread
 from submin.query.source import Index, NetworkSource, existing_cells
 from submin.tiling.cover import Cover
 
@@ -85,13 +85,7 @@ def control_of_block(
     selections, _ = points_named(source, ids, cells)
     if most is not None:
         selections = well_spread(selections, most)
-    kept: list[Selection] = []
-    parts: list[GroundPart] = []
-    for selection in selections:
-        determined, part = ground_part(source, selection)
-        if len(determined.rows):
-            kept.append(determined)
-            parts.append(part)
+    kept, parts = determined_parts(source, selections)
     if not parts:
         return None
     chosen, tiles = choose(source, kept, policy, None)

@@ -167,13 +167,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
         When the policy is unknown, or ``tile`` is asked of points that no one tile holds.
     """
     check_policy(policy)
-    kept: list[Selection] = []
-    parts: list[GroundPart] = []
-    for selection in selections:
-        kept_selection, part = ground_part(source, selection)
-        if len(kept_selection.rows):
-            kept.append(kept_selection)
-            parts.append(part)
+    kept, parts = determined_parts(source, selections)
     if not parts:
         none = np.empty(0, dtype=np.int64)
         return Answer(
@@ -222,6 +216,12 @@ def choose(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     if policy == "tile":
         raise QueryError("no one tile holds all queried points; use policy 'rigorous' or 'auto', a smaller area, or name a tile")
     return ("rigorous" if policy == "auto" else policy), sorted({t for cell in cells for t in cover.holders(cell)})
+
+
+def determined_parts(source: NetworkSource, selections: Sequence[Selection]) -> tuple[list[Selection], list[GroundPart]]:
+    """Those of some points that are determined, and their ground parts; cells without any are left out."""
+    both = [ground_part(source, selection) for selection in selections]
+    return [kept for kept, _ in both if len(kept.rows)], [part for kept, part in both if len(kept.rows)]
 
 
 def ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection, GroundPart]:
