@@ -1,0 +1,172 @@
+"""Commands that make a network and change it: create, run, control add, withdraw, tag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, show
+
+app = typer.Typer()
+control_app = typer.Typer(no_args_is_help=True, help="Surveyed control points.")
+app.add_typer(control_app, name="control")
+
+
+@app.command()
+def create(
+    network: Annotated[str, typer.Argument(help="Folder or s3:// URL of the new network.")],
+    bbox: Box = None,
+    aoi: Aoi = None,
+    fit: Annotated[
+        Path | None, typer.Option("--fit", help="Catalogue whose footprints give the area, and tile sizes that suit them.")
+    ] = None,
+    tile_km: Annotated[float | None, typer.Option("--tile-km", help="Side of a core; default 100, or 4 footprints with --fit.")] = None,
+    overlap_km: Annotated[float | None, typer.Option("--overlap-km", help="Width that neighbours share, below the core's.")] = None,
+    form: Annotated[str, typer.Option("--form", help="Form of the sub-MINs.")] = "factored",
+    frame: Annotated[str, typer.Option("--frame", help="Frame of the coordinates; with --fit the catalogue's.")] = "WGS84",
+    epoch: Annotated[str, typer.Option("--epoch", help="Epoch of the frame; with --fit the catalogue's.")] = "",
+    max_parameters: Annotated[
+        int, typer.Option("--max-parameters", min=60, help="A tile that sees more image parameters (6 an image) is split into four.")
+    ] = 2500,
+    as_json: Json = False,
+) -> None:
+    """Make an empty network over an area.
+
+    Example: submin create network --bbox 97 33 103 37 --tile-km 100 --overlap-km 50
+    """
+    from orchestration.create import create as make
+    from orchestration.create import fit_catalogue, read_area
+    from submin.errors import InputError
+    from submin.storage.catalogue import Catalogue
+    from submin.storage.catalogue_schema import CatalogueMetadata
+    from submin.storage.network import box_area
+
+    if sum(value is not None for value in (bbox, aoi, fit)) != 1:
+        raise InputError("give the area by exactly one of --bbox, --aoi and --fit")
+    metadata = CatalogueMetadata(name="network", frame=frame, epoch=epoch)
+    if fit is not None:
+        fitted = Catalogue.open(fit)
+        area, core, shared = fit_catalogue(fitted)
+        metadata, tile_km = fitted.metadata, core if tile_km is None else tile_km
+        overlap_km = min(shared, 0.5 * tile_km) if overlap_km is None else overlap_km
+    else:
+        area = box_area(bbox) if bbox is not None else read_area(aoi)  # type: ignore[arg-type]
+    made = make(network, area, metadata, tile_km, overlap_km, form, max_parameters)
+    cover = made.cover
+    show(made.to_json(), as_json, f"{network}: {cover.rows} x {cover.columns} tiles, cores of {cover.core / 1000:g} km, "
+         f"overlap {cover.overlap / 1000:g} km, frame {metadata.frame}")  # fmt: skip
+
+
+@app.command()
+def run(
+    catalogue: Annotated[Path, typer.Argument(help="Catalogue of image blocks.")],
+    network: Annotated[str, typer.Argument(help="Network that takes them.")],
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    batch_blocks: Annotated[int, typer.Option("--batch-blocks", help="Blocks that one commit holds.")] = 500,
+    sequential: Annotated[bool, typer.Option("--sequential", help="Fuse block by block, in the order of the catalogue.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Fuse every block of a catalogue that the network does not have yet. The same command again continues, or says that nothing is left.
+
+    Example: submin run catalogue network --workers 2
+    """
+    from orchestration.executors import executor_for
+    from orchestration.progress import progress_bars
+    from orchestration.run import run as fuse
+    from orchestration.stopping import resumable
+    from submin.storage.catalogue import Catalogue
+
+    check_range("--workers", workers, 0, MOST_WORKERS)
+    check_range("--batch-blocks", batch_blocks, 1)
+    opened = Catalogue.open(catalogue)
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+        result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
+    lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
+    if result.rays_used:
+        lines.append(
+            f"{result.rays_used:,} rays used, {result.rays_rejected:,} rejected as blunders, RMS {result.ray_rms_px:.3f} px; "
+            f"{result.seconds:.1f} s, {result.peak_memory_mb:.0f} MB"
+        )
+    if not result.fused and not result.rejected:
+        lines[0] = f"{network} {result.version}: nothing is left to do, all {result.skipped} blocks are in the network"
+    lines += [f"bad camera {f.image_id}: {f.reason}" for f in result.flagged]
+    lines += [f"rejected block {r.block_id}: {r.reason}" for r in result.rejected]
+    lines += [f"tile {t}: the judgement of its rays did not settle; they are used as last judged" for t in result.unsettled_tiles]
+    show(result.to_json(), as_json, "\n".join(lines))
+    if result.rejected:
+        raise typer.Exit(1)
+
+
+@control_app.command("add")
+def control_add(
+    network: Annotated[str, typer.Argument(help="Network that takes them.")],
+    points: Annotated[Path, typer.Argument(help="Table of surveyed points with their covariance or sigmas.")],
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Add surveyed control points, known by the ids of tie points or new ones. The same file again does nothing.
+
+    Example: submin control add network control.parquet
+    """
+    from orchestration.control import add_control
+    from orchestration.executors import executor_for
+    from orchestration.progress import progress_bars
+    from orchestration.stopping import resumable
+    from submin.storage.point_table import read_point_table
+
+    table = read_point_table(points, "definite")
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+        added = add_control(table, str(points), network, executor, reporter)
+    lines = [
+        f"{network} {added.version}: {added.fused} control points added, {added.skipped} already there, {len(added.rejected)} rejected"
+    ]
+    lines += [f"rejected {r.point_id}: {r.reason}" for r in added.rejected]
+    show(added.to_json(), as_json, "\n".join(lines))
+    if added.rejected:
+        raise typer.Exit(1)
+
+
+@app.command()
+def withdraw(
+    network: Annotated[str, typer.Argument(help="Network to withdraw from.")],
+    block: Annotated[str | None, typer.Option("--block", help="Id of a block, with all its images.")] = None,
+    image: Annotated[str | None, typer.Option("--image", help="Id of one image; the rest of its block stays.")] = None,
+    control: Annotated[str | None, typer.Option("--control", help="Id of a control point.")] = None,
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Withdraw a block, an image or a control point, as if it had never been fused. It can come again.
+
+    Example: submin withdraw network --image IMAGE_17
+    """
+    from orchestration.executors import executor_for
+    from orchestration.progress import progress_bars
+    from orchestration.stopping import resumable
+    from orchestration.withdraw import withdraw as take
+
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+        done = take(network, executor, block=block, image=image, control=control, reporter=reporter)
+    show(done.to_json(), as_json, f"{network} {done.version}: {done.what} withdrawn with {done.rays:,} rays; "
+         f"{len(done.tiles)} tiles judged again")  # fmt: skip
+
+
+@app.command()
+def tag(
+    network: Annotated[str, typer.Argument(help="Network.")],
+    name: Annotated[str, typer.Argument(help="Name to give, a word such as delivered-2026.")],
+    at: Annotated[str | None, typer.Option("--at", help="Version; default: the newest.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Give a version a name that stays; --at takes it wherever it takes a version.
+
+    Example: submin tag network delivered-2026 --at v12
+    """
+    from submin.storage.network_store import tag_version
+
+    version = tag_version(network, name, at)
+    show({"version": version.name, "tags": list(version.tags)}, as_json, f"{network} {version.name} is tagged {name}")

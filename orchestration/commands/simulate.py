@@ -1,0 +1,87 @@
+"""``submin simulate``: catalogues of simulated images, with truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from orchestration.commands.shared import Json, Seed, check_range, show
+
+if TYPE_CHECKING:
+    from submin.simulation.scene import Layout
+
+app = typer.Typer(no_args_is_help=True, help="Make a catalogue of simulated images, with truth.")
+
+
+@app.command("region")
+def simulate_region_command(
+    catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")],
+    scale: Annotated[float, typer.Option("--scale", help="Part of the 400 km x 400 km in area.")] = 1.0,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate three-line triplets over a region: some 150 blocks, 0.2 % blunders, one bad camera.
+
+    Example: submin simulate region --out catalogue --scale 0.25
+    """
+    from submin.errors import InputError
+    from submin.simulation.region import RegionDesign, simulate_region
+    from submin.storage.simulated import write_region
+
+    if not 0.01 <= scale <= 100.0:
+        raise InputError(f"--scale is {scale:g}; expected 0.01 to 100")
+    check_range("--seed", seed, 0)
+    side = 400.0 * scale**0.5
+    region = simulate_region(RegionDesign(width_km=side, height_km=side, seed=seed))
+    write_region(region, catalogue)
+    values = {
+        "catalogue": str(catalogue), "simulated": True, "images": len(region.images), "blocks": len({i.block_id for i in region.images}),
+        "points": len(region.point_ids), "rays": len(region.image), "blunders": int(region.blunder.sum()),
+        "bad_cameras": list(region.bad_cameras),
+    }  # fmt: skip
+    show(values, as_json, f"{catalogue}: simulated {values['images']} images in {values['blocks']} blocks, {values['points']:,} points, "
+         f"{values['rays']:,} rays, of which {values['blunders']} blunders; bad camera: {', '.join(region.bad_cameras)}")  # fmt: skip
+
+
+@app.command("five-blocks")
+def simulate_five_blocks_command(
+    catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")], seed: Seed = 0, as_json: Json = False
+) -> None:
+    """Simulate the 2008 MIN paper's experiment: 18 frame images in 5 blocks, 62 points, and four surveyed ones as control-external.
+
+    Example: submin simulate five-blocks --out catalogue
+    """
+    from submin.simulation.five_blocks import five_blocks
+
+    simulate_layout(five_blocks(), catalogue, seed, as_json)
+
+
+@app.command("worldview")
+def simulate_worldview_command(
+    catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")], seed: Seed = 0, as_json: Json = False
+) -> None:
+    """Simulate the 2010 paper's experiment: 50 WorldView-1 pairs, 1,347 points, 101 of them surveyed, nine of these in control-external.
+
+    Example: submin simulate worldview --out catalogue
+    """
+    from submin.simulation.worldview import worldview
+
+    simulate_layout(worldview(), catalogue, seed, as_json)
+
+
+def simulate_layout(layout: Layout, catalogue: Path, seed: int, as_json: bool) -> None:
+    """Write a realisation of a layout and say what it holds."""
+    from submin.simulation.scene import realise
+    from submin.storage.simulated import write_scene
+
+    check_range("--seed", seed, 0)
+    write_scene(realise(layout, seed), catalogue)
+    values = {
+        "catalogue": str(catalogue), "simulated": True, "images": len(layout.images), "blocks": len(layout.priors),
+        "points": len(layout.point_ids), "rays": len(layout.image), "check_points": len(layout.check.points),
+        "external_control": layout.point_ids[layout.control.points].tolist(),
+    }  # fmt: skip
+    show(values, as_json, f"{catalogue}: simulated {values['images']} images in {values['blocks']} blocks, {values['points']:,} points, "
+         f"{values['rays']:,} rays; external control, not in a run by itself: {catalogue}/control-external.parquet")  # fmt: skip
