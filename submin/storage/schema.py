@@ -21,7 +21,7 @@ from submin.network.sub_min import SubMin, wider
 from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 COVARIANCE_CHUNK = 256
 
 IMAGE_COLUMNS = {

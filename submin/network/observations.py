@@ -1,0 +1,67 @@
+"""Observations of ground points that come without images: positions and baselines with one covariance, as GNSS gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from submin.errors import InputError
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.str_]
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """Positions and baselines whose errors are correlated with one another and with nothing else: one block of information.
+
+    Attributes
+    ----------
+    cluster_id : name of the cluster, its block in the ledger
+    from_ids : (k,) start of each baseline, or the point whose position is given
+    to_ids : (k,) end of each baseline; empty text for a position
+    values : (k, 3) geocentric metres: the position, or the vector from start to end
+    covariance : (3k, 3k) square metres, positive definite, observation-major
+
+    Raises
+    ------
+    InputError
+        When shapes do not match, a number is not finite, or a baseline ends where it starts.
+    """
+
+    cluster_id: str
+    from_ids: Ids
+    to_ids: Ids
+    values: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        k = len(self.from_ids)
+        shapes = {"from_ids": (k,), "to_ids": (k,), "values": (k, 3), "covariance": (3 * k, 3 * k)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise InputError(f"cluster {self.cluster_id}: {name} has shape {getattr(self, name).shape}; expected {shape}")
+        if not k:
+            raise InputError(f"cluster {self.cluster_id}: holds no observation; expected positions or baselines")
+        for name in ("values", "covariance"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(f"cluster {self.cluster_id}: {name} holds something that is not finite; expected metres")
+        if (self.from_ids == self.to_ids).any():
+            point = self.from_ids[self.from_ids == self.to_ids][0]
+            raise InputError(f"cluster {self.cluster_id}: a baseline goes from {point} to itself; expected two points")
+
+    def __len__(self) -> int:
+        return len(self.from_ids)
+
+    @property
+    def positions(self) -> NDArray[np.bool_]:
+        """True (k,) for positions, False for baselines."""
+        return np.asarray(self.to_ids == "")
+
+    @property
+    def point_ids(self) -> Ids:
+        """The points concerned, each once, ascending."""
+        every = np.unique(np.concatenate([self.from_ids, self.to_ids]))
+        return every[every != ""]
