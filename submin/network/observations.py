@@ -64,4 +64,4 @@ class Cluster:
     def point_ids(self) -> Ids:
         """The points concerned, each once, ascending."""
         every = np.unique(np.concatenate([self.from_ids, self.to_ids]))
-        return every[every != ""]
+        return np.asarray(every[every != ""])
