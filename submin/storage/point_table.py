@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from submin.errors import CatalogueError, InputError
 from submin.formats.columns import Column, column_names, number, number_values, read_table, refuse, text, text_values
-from submin.formats.tables import covariance_of_rows
+from submin.formats.tables import covariance_of_rows, covariance_rows
 from submin.geodesy import local_axes, rotate_covariance
 from submin.storage.catalogue_schema import COVARIANCE_COLUMNS, SIGMA_COLUMNS, PointTable, first_repeated
 
@@ -66,6 +66,21 @@ def read_point_table(path: str | Path, covariance: Covariances = "any") -> Point
         refuse(pa.array(~(np.abs(geodetic[:, k]) <= limit)), table[name], name, file, 1, expected)
     enu, joint = _covariances(table, file, geodetic, covariance)
     return PointTable(point_ids, geodetic, enu, text_values(table, "area"), joint)
+
+
+def point_columns(points: PointTable, covariance: bool = True) -> pa.Table:
+    """The columns of a table of points, as `read_point_table` reads them; without ``covariance`` the coordinates only."""
+    columns: dict[str, object] = {
+        "point_id": pa.array(points.point_ids, pa.string()),
+        **{name: points.geodetic[:, k] for k, name in enumerate(("longitude", "latitude", "height"))},
+    }
+    if covariance:
+        columns["area"] = pa.array(points.area, pa.string())
+        row, column = np.triu_indices(3)
+        columns |= {name: points.covariance_enu[:, i, j] for name, i, j in zip(COVARIANCE_COLUMNS, row, column, strict=True)}
+        if points.joint_covariance is not None:
+            columns["covariance_row"] = covariance_rows(points.joint_covariance, 0, len(points))
+    return pa.table(columns)
 
 
 def _refuse_derived(path: Path) -> None:
@@ -135,4 +150,4 @@ def _joint_covariance(table: pa.Table, path: Path) -> Array:
         raise CatalogueError(str(error)) from None
 
 
-__all__ = ["POINT_COLUMNS", "Covariances", "PointTable", "read_point_table"]
+__all__ = ["POINT_COLUMNS", "Covariances", "PointTable", "point_columns", "read_point_table"]
