@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from submin.errors import CatalogueError, InputError
 from submin.formats.columns import Column, column_names, number, number_values, read_table, refuse, text, text_values
+from submin.formats.replacing import replacing
 from submin.formats.tables import covariance_of_rows, covariance_rows
 from submin.geodesy import local_axes, rotate_covariance
 from submin.storage.catalogue_schema import COVARIANCE_COLUMNS, SIGMA_COLUMNS, PointTable, first_repeated
@@ -83,6 +85,23 @@ def point_columns(points: PointTable, covariance: bool = True) -> pa.Table:
     return pa.table(columns)
 
 
+def write_point_table(path: str | Path, points: PointTable, metadata: Mapping[str, str]) -> None:
+    """Write points as a Parquet file of their own, with texts that say where they come from; nothing that is there is written over.
+
+    Raises
+    ------
+    InputError
+        When the name does not end in ``.parquet``, something is there already, or it cannot be written.
+    """
+    file = Path(path)
+    if file.suffix != ".parquet":
+        raise InputError(f"{file}: unknown suffix {file.suffix!r}; expected .parquet")
+    if file.exists():
+        raise InputError(f"{file}: already exists; choose another place, or remove it first")
+    with replacing(file) as temporary:
+        pq.write_table(point_columns(points).replace_schema_metadata(dict(metadata)), temporary, compression="zstd")
+
+
 def _refuse_derived(path: Path) -> None:
     """Refuse points that a network or an adjustment gave, before they are read: as control their rays count twice (Rule 0)."""
     expected = "expected surveyed points: what comes from rays, entered beside them, counts twice"
@@ -150,4 +169,4 @@ def _joint_covariance(table: pa.Table, path: Path) -> Array:
         raise CatalogueError(str(error)) from None
 
 
-__all__ = ["POINT_COLUMNS", "Covariances", "PointTable", "point_columns", "read_point_table"]
+__all__ = ["POINT_COLUMNS", "Covariances", "PointTable", "point_columns", "read_point_table", "write_point_table"]
