@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +13,9 @@ from submin.errors import InputError
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.str_]
+
+_HASHED_ROWS = 96
+"""Rows of a covariance whose digest is computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,4 +69,23 @@ class Cluster:
     def point_ids(self) -> Ids:
         """The points concerned, each once, ascending."""
         every = np.unique(np.concatenate([self.from_ids, self.to_ids]))
-        return np.asarray(every[every != ""])
+        return np.asarray(every[every != ""], dtype=np.str_)
+
+    def content_hash(self) -> str:
+        """Hexadecimal BLAKE2b of the observations: points, values, and the lower triangle of the covariance.
+
+        The order of the observations leaves no trace, neither does the name of the cluster: a network knows by it what it holds already.
+        """
+        values = np.asarray(self.values, dtype="<f8") + 0.0  # + 0.0: one sign of zero
+        order = np.lexsort((*values.T[::-1], self.to_ids, self.from_ids))
+        head = [[str(a), str(b)] for a, b in zip(self.from_ids[order], self.to_ids[order], strict=True)]
+        digest = hashlib.blake2b(json.dumps(head).encode(), digest_size=32)
+        digest.update(np.ascontiguousarray(values[order]).tobytes())
+        rows = (3 * order[:, None] + np.arange(3)).ravel()
+        for first in range(0, len(rows), _HASHED_ROWS):  # of a large covariance never a second copy
+            chosen = rows[first : first + _HASHED_ROWS]
+            # The symmetric value is taken from the triangle that is stored.
+            i, j = np.maximum(chosen[:, None], rows), np.minimum(chosen[:, None], rows)
+            part = np.tril(self.covariance[i, j], first) + 0.0
+            digest.update(np.ascontiguousarray(part, dtype="<f8").tobytes())
+        return digest.hexdigest()
