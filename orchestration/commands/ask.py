@@ -32,7 +32,7 @@ def query(
     at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
     max_points: Annotated[int | None, typer.Option("--max-points", help="At most so many points, well spread.")] = None,
     output: Annotated[
-        Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")
+        Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson, .csv or .gcp.")
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -223,7 +223,7 @@ class ControlSet:
         return tables.ControlTable(columns, self.covariance, metadata)
 
     def write(self, path: str | Path) -> None:
-        """Write to a file of the format that its suffix names: ``.parquet``, ``.npz``, ``.geojson`` or ``.csv``.
+        """Write to a file of the format that its suffix names: ``.parquet``, ``.npz``, ``.geojson``, ``.csv`` or ``.gcp``.
 
         Raises
         ------
