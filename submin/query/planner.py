@@ -83,6 +83,12 @@ def points_in_area(source: NetworkSource, area: BaseGeometry) -> list[Selection]
     return [s for s in selections if len(s.rows)]
 
 
+def all_points(source: NetworkSource) -> list[Selection]:
+    """All determined points of a network."""
+    cells = [source.cell(number) for number in source.cell_numbers()]
+    return [s for s in (Selection(cell, np.flatnonzero(_determined(cell))) for cell in cells) if len(s.rows)]
+
+
 def points_of_tile(source: NetworkSource, number: int) -> list[Selection]:
     """All determined points that a tile holds."""
     existing = set(source.cell_numbers())

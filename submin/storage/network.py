@@ -13,14 +13,26 @@ from shapely.geometry.base import BaseGeometry
 
 from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
+from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
 from submin.network.cell import Cell, widened_sums
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import GroundPart, SubMin
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import cross_covariance
-from submin.query.planner import Answer, answer, determined_parts, points_in_area, points_named, points_of_tile, well_spread
+from submin.query.planner import (
+    Answer,
+    Selection,
+    all_points,
+    answer,
+    determined_parts,
+    points_in_area,
+    points_named,
+    points_of_tile,
+    well_spread,
+)
 from submin.storage.arrays import group_of, read_record
+from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
 from submin.tiling.cover import Cover
@@ -91,6 +103,60 @@ class Network:
         QueryError
             When nothing or too much is asked, a policy, tile or point is unknown, or a box is not one.
         """
+        selections, number = self._selected(bbox, area, points, tile, max_points)
+        return self._control_set(answer(self, selections, policy, number))
+
+    def export(
+        self,
+        path: str | Path,
+        *,
+        bbox: tuple[float, float, float, float] | None = None,
+        area: BaseGeometry | None = None,
+        tile: str | None = None,
+        policy: str = "auto",
+        max_points: int | None = None,
+        family: str = AUTO,
+        rank: int = 0,
+        floor: float | None = None,
+    ) -> CompactControl:
+        """Write control points with a compact joint covariance: 3 x 3 blocks and correlation functions (docs/correlation.md).
+
+        Parameters
+        ----------
+        path : file to write, ``.parquet``
+        bbox, area, tile, policy, max_points : which points, as in `query`; without any of the first three all points
+        family, rank, floor : as in `ControlSet.compact`
+
+        Returns
+        -------
+        CompactControl
+            What `read_compact` reads from the file.
+
+        Raises
+        ------
+        QueryError
+            As `query` does.
+        InputError
+            When the family is unknown, there are too few or too many points, rank or floor are out of range, or the file cannot be
+            written; nothing is written then.
+        """
+        check_suffix(path)
+        check_asked(family, rank, floor)
+        if bbox is None and area is None and tile is None:
+            selections, number = all_points(self), None
+            if max_points is not None:
+                selections = well_spread(selections, max_points)
+        else:
+            selections, number = self._selected(bbox, area, None, tile, max_points)
+        check_size(sum(len(s.rows) for s in selections))  # before a joint covariance of that size is made
+        control = self._control_set(answer(self, selections, policy, number))
+        return write_compact(path, control, control.compact(family, rank, floor))
+
+    def _selected(
+        self, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None, points: Sequence[str] | NDArray[np.str_] | None,
+        tile: str | None, max_points: int | None,
+    ) -> tuple[list[Selection], int | None]:  # fmt: skip
+        """Points that are asked for, and the number of the tile that is named."""
         asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
         if len(asked) > 1 or (not asked and tile is None):
             raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
@@ -119,7 +185,7 @@ class Network:
             selections = [s for s in selections if s.cell.number in held]
         if max_points is not None:
             selections = well_spread(selections, max_points)
-        return self._control_set(answer(self, selections, policy, number))
+        return selections, number
 
     def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
         """Those of some points that the network can answer for, by their cell."""

@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import icechunk
 import numpy as np
@@ -801,6 +802,36 @@ def _(w: World) -> list[Any]:
 def _(w: World) -> list[Any]:
     w.around = lambda: limited(1000)
     return ["map", w.fused, "--out", w.folder / "map.png"]
+
+
+# --- export -----------------------------------------------------------------------------------------------------------------------------
+
+
+def export(w: World, *words: Any, out: str = "compact.parquet", family: str = "exponential") -> list[Any]:
+    return ["export", w.fused, "--out", w.folder / out, "--family", family, *words]
+
+
+simply("unknown family of correlation functions", lambda w: export(w, family="sinc"))
+simply("correlation function that is indefinite in the plane", lambda w: export(w, family="tent"))
+simply("floor of a family that has none", lambda w: export(w, "--floor-km", 50))
+simply("floor that is not positive", lambda w: export(w, "--floor-km", 0))
+simply("more vectors than coordinates", lambda w: export(w, "--rank", 1000))
+simply("negative number of vectors", lambda w: export(w, "--rank", -1))
+simply("no points to condense", lambda w: export(w, "--bbox", 99, 34, 99.001, 34.001))
+simply("export of unknown format", lambda w: export(w, out="compact.csv"))
+simply("export to a folder that does not exist", lambda w: export(w, out="nowhere/compact.parquet"))
+
+
+@case("too many points to condense")
+def _(w: World) -> list[Any]:
+    w.around = lambda: mock.patch("submin.correlation.compact.MOST_POINTS", 10)
+    return export(w)
+
+
+@case("export as control")
+def _(w: World) -> list[Any]:
+    submin.open(w.fused).export(w.folder / "compact.parquet", family="exponential", max_points=9)
+    return ["control", "add", w.fused, w.folder / "compact.parquet"]
 
 
 # --- withdrawal, control and tags -------------------------------------------------------------------------------------------------------
