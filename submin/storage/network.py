@@ -83,7 +83,7 @@ class Network:
         points : ids of points
         tile : name of a tile; alone, all points that it holds
         policy : ``auto``, ``tile``, ``ci`` or ``rigorous`` (docs/accuracy.md)
-        max_points : at most so many, well spread and seen by many rays
+        max_points : at most so many, 1 or more, well spread and well determined
 
         Raises
         ------
@@ -117,7 +117,7 @@ class Network:
             held = set(self.cover.cells_held(number))
             selections = [s for s in selections if s.cell.number in held]
         if max_points is not None:
-            selections = well_spread(selections, max_points)
+            selections = well_spread(self, selections, max_points)
         return self._control_set(answer(self, selections, policy, number))
 
     def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
