@@ -29,7 +29,7 @@ def query(
         Path | None, typer.Option("--points", help="CSV or Parquet with a column point_id, or text with one id a line.")
     ] = None,
     tile: Annotated[str | None, typer.Option("--tile", help="Name of a tile: its sub-MIN alone.")] = None,
-    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "auto",
+    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci, bci, split or rigorous.")] = "auto",
     at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
     max_points: Annotated[int | None, typer.Option("--max-points", help="At most so many points, well spread and well determined.")] = None,
     on: Annotated[str | None, typer.Option("--on", metavar="DATE", help="Day on which points must be valid; default: today (UTC).")] = None,
@@ -85,7 +85,7 @@ def query(
 def check(
     network: Annotated[str, typer.Argument(help="Network to check.")],
     points: Annotated[Path, typer.Argument(help="Table of check points, by the ids of tie points.")],
-    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "rigorous",
+    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci, bci, split or rigorous.")] = "rigorous",
     output: Annotated[Path | None, typer.Option("--out", help="Text file that takes the table too.")] = None,
     as_json: Json = False,
 ) -> None:

@@ -103,7 +103,7 @@ def write_parquet(path: str | Path, table: ControlTable) -> None:
     schema = points.schema.append(pa.field("covariance_row", pa.list_(pa.float64()))).with_metadata(metadata)
     # A dictionary pays for tile names only; tried on a covariance it costs time and gains nothing.
     with replacing(path) as temporary, pq.ParquetWriter(temporary, schema, use_dictionary=["tile"]) as writer:
-        for first, last in _row_groups(points.num_rows):
+        for first, last in row_groups(points.num_rows):
             rows = covariance_rows(table.covariance, first, last)
             group = points.slice(first, last - first).append_column("covariance_row", rows)
             writer.write_table(group.cast(schema))
@@ -215,7 +215,7 @@ def covariance_rows(covariance: Array, first: int, last: int) -> pa.ListArray:
     return pa.ListArray.from_arrays(pa.array(offsets), pa.array(np.asarray(values, dtype=np.float64)))
 
 
-def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> Array:
+def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str, first_row: int = 0) -> Array:
     """Joint covariance (3n, 3n), symmetric, of the chunks of a column ``covariance_row`` of n points in their order.
 
     Parameters
@@ -226,6 +226,8 @@ def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> 
         n.
     source : str
         File named in errors.
+    first_row : int
+        Its row of the first point, in errors.
 
     Raises
     ------
@@ -236,7 +238,7 @@ def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> 
     first = 0
     for chunk in chunks:
         last = first + len(chunk)
-        lower, values = _lower(first, last), _row_values(chunk, first, source)
+        lower, values = _lower(first, last), _row_values(chunk, first, source, first_row)
         rows = covariance[3 * first : 3 * last, : 3 * last]
         rows[lower] = values
         covariance[: 3 * first, 3 * first : 3 * last] = rows[:, : 3 * first].T
@@ -246,7 +248,7 @@ def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> 
     return covariance
 
 
-def _row_values(chunk: pa.Array, first: int, source: str) -> Array:
+def _row_values(chunk: pa.Array, first: int, source: str, first_row: int) -> Array:
     """Values of consecutive covariance rows, checked, of which the first is that of point ``first``."""
     if not (pa.types.is_list(chunk.type) or pa.types.is_large_list(chunk.type)):
         raise InputError(f"{source}: column 'covariance_row' is of type {chunk.type}; expected lists of float64")
@@ -255,7 +257,8 @@ def _row_values(chunk: pa.Array, first: int, source: str) -> Array:
     if (lengths != expected).any():
         i = int(np.argmax(lengths != expected))
         raise InputError(
-            f"{source}: row {first + i}: covariance_row has {lengths[i]} values; expected {expected[i]} (3 x 3(i+1) for row i from 0). "
+            f"{source}: row {first_row + first + i}: covariance_row has {lengths[i]} values; expected {expected[i]} "
+            "(3 x 3(i+1) for row i from 0). "
             "Rows that were taken out or sorted differently have lost their meaning: query again for other points"
         )
     try:
@@ -265,7 +268,7 @@ def _row_values(chunk: pa.Array, first: int, source: str) -> Array:
     bad = ~np.isfinite(values)
     if bad.any():
         i = int(np.searchsorted(np.cumsum(expected), np.argmax(bad), side="right"))
-        raise InputError(f"{source}: row {first + i}: covariance_row holds a value that is null or not finite; expected m2")
+        raise InputError(f"{source}: row {first_row + first + i}: covariance_row holds a value that is null or not finite; expected m2")
     return values
 
 
@@ -280,7 +283,7 @@ def _lower(first: int, last: int) -> NDArray[np.bool_]:
     return np.asarray(np.arange(3 * last)[None, :] < end[:, None])
 
 
-def _row_groups(points: int) -> Iterator[tuple[int, int]]:
+def row_groups(points: int) -> Iterator[tuple[int, int]]:
     """First and last (excluded) point of each row group; a group ends where it reaches `_GROUP_VALUES`."""
     group = np.cumsum(_lengths(0, points)) // _GROUP_VALUES
     edges = [0, *(np.flatnonzero(np.diff(group)) + 1).tolist(), points]

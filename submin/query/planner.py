@@ -16,7 +16,7 @@ from submin.errors import QueryError
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.cell import Cell, factors
 from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate
-from submin.query import covariance_intersection, rigorous, tile
+from submin.query import bounded_inflation, covariance_intersection, rigorous, split_intersection, tile
 from submin.query.source import Index, NetworkSource
 from submin.query.spread import spread_rows
 
@@ -27,6 +27,8 @@ Policy = Callable[[NetworkSource, Sequence[int], Index, Sequence[GroundPart]], S
 POLICIES: dict[str, Policy] = {
     "tile": tile.estimate,
     "ci": covariance_intersection.estimate,
+    "bci": bounded_inflation.estimate,
+    "split": split_intersection.estimate,
     "rigorous": rigorous.estimate,
 }
 """Merge policies. A new one is one file, one line here and one row in the table of `tests/property/test_policies.py`."""
@@ -200,7 +202,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
         np.concatenate([np.full(len(s.rows), source.cover.owner(s.cell.number)) for s in kept])[order],
         np.concatenate([ray_counts(s.cell)[s.rows] for s in kept])[order],
         policy, tuple(tiles), state.images,
-        policy != "ci" and held.issuperset(source.cell_numbers()),
+        policy in ("tile", "rigorous") and held.issuperset(source.cell_numbers()),
     )  # fmt: skip
 
 

@@ -19,10 +19,11 @@ from submin.adjustment.images import ImageSet
 from submin.errors import QueryError
 from submin.network.cell import Cell, widened_sums
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.sub_min import SubMin
+from submin.network.sub_min import GroundPart, SubMin
 from submin.network.thinning import reported_points
 from submin.query.control_set import ControlSet
-from submin.query.planner import Answer, Selection, answer, points_in_area, points_named, points_of_tile, well_spread
+from submin.query.cross_covariance import cross_covariance
+from submin.query.planner import Answer, Selection, answer, determined_parts, points_in_area, points_named, points_of_tile, well_spread
 from submin.query.point_metadata import PointMetadata, metadata_of_points
 from submin.storage.arrays import group_of, read_record
 from submin.storage.check_points import check_points
@@ -91,7 +92,7 @@ class Network:
         area : polygon or polygons, longitude and latitude in degrees
         points : ids of points
         tile : name of a tile; alone, all points that it holds
-        policy : ``auto``, ``tile``, ``ci`` or ``rigorous`` (docs/accuracy.md)
+        policy : ``auto``, ``tile``, ``ci``, ``bci``, ``split`` or ``rigorous`` (docs/accuracy.md)
         max_points : at most so many, well spread and well determined
         on : day on which points must be valid; default: today (UTC)
 
@@ -213,6 +214,48 @@ class Network:
         ids = np.unique(np.asarray(points, dtype=np.str_))
         selections, _ = points_named(self, ids, self._snapshot.candidate_cells(ids))
         return {s.cell.number: s.cell.point_ids[s.rows] for s in selections}
+
+    def cross_covariance(
+        self, one: str, other: str, ids_one: Sequence[str] | NDArray[np.str_], ids_other: Sequence[str] | NDArray[np.str_]
+    ) -> Array:
+        """Covariance of the answers of two tiles, each by itself.
+
+        Parameters
+        ----------
+        one, other : names of the tiles
+        ids_one, ids_other : n points that the one holds, and k that the other does, in any order; points of both overlap
+
+        Returns
+        -------
+        (3n, 3k), geocentric square metres, in the order of the ids: ``Cov(x of one, x of other)``.
+
+        Raises
+        ------
+        QueryError
+            When a tile does not hold a point, or a point is not determined.
+        """
+        tiles = self.cover.tile_number(one), self.cover.tile_number(other)
+        found = [self._parts_of_tile(tile, np.asarray(ids, dtype=np.str_)) for tile, ids in zip(tiles, (ids_one, ids_other), strict=True)]
+        (names, parts, places), (names_other, parts_other, places_other) = found
+        whole = cross_covariance(self, tiles, (names, names_other), (parts, parts_other))
+        axes = np.arange(3)
+        return np.asarray(whole[np.ix_((3 * places[:, None] + axes).ravel(), (3 * places_other[:, None] + axes).ravel())])
+
+    def _parts_of_tile(self, tile: int, ids: NDArray[np.str_]) -> tuple[NDArray[np.str_], list[GroundPart], NDArray[np.int64]]:
+        """Ground parts of named points that a tile holds, the names in their order, and the place of each id asked for."""
+        unique = np.unique(ids)
+        cells = self._snapshot.candidate_cells(unique)
+        selections, missing = points_named(self, unique, np.where(np.isin(cells, self.cover.cells_held(tile)), cells, -1))
+        kept, parts = determined_parts(self, selections)
+        names = np.concatenate([np.empty(0, dtype="U1"), *(s.cell.point_ids[s.rows] for s in kept)])
+        missing = np.unique(np.concatenate([missing, np.setdiff1d(unique, names)]))
+        if len(missing):
+            raise QueryError(
+                f"tile {self.cover.tile_name(tile)} does not hold {len(missing)} of {len(unique)} points, or they are not yet determined: "
+                f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+            )
+        order = np.argsort(names)
+        return names, parts, order[np.searchsorted(names[order], ids)]
 
     def tile(self, name: str) -> TileView:
         """One sub-MIN alone."""

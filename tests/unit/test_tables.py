@@ -285,7 +285,7 @@ def test_npz_of_something_else(tmp_path: Path) -> None:
 
 def test_row_groups_cover_all_points_and_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "_GROUP_VALUES", 1000)
-    groups = list(tables._row_groups(100))
+    groups = list(tables.row_groups(100))
     assert groups[0][0] == 0 and groups[-1][1] == 100
     assert all(a[1] == b[0] for a, b in pairwise(groups))
     # A group may pass the limit by less than one row.
