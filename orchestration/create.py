@@ -39,6 +39,7 @@ class Created:
         return {
             "network": self.place, "tiles": self.cover.tile_count, "rows": self.cover.rows, "columns": self.cover.columns,
             "tile_km": self.cover.core / 1000.0, "overlap_km": self.cover.overlap / 1000.0, "frame": self.metadata.frame, "version": "v0",
+            "thin_metres": self.metadata.thinning,
         }  # fmt: skip
 
 
@@ -50,8 +51,11 @@ def create(
     overlap_km: float | None,
     form: str = "factored",
     max_parameters: int = 2500,
+    thin_metres: float | None = None,
 ) -> Created:
     """Create an empty network over an area (longitude and latitude, degrees).
+
+    ``thin_metres``: it reports one point in each square of this side; all points without one (decision 013).
 
     Raises
     ------
@@ -62,13 +66,15 @@ def create(
     """
     if form != "factored":
         raise InputError(f"form is {form!r}; this release makes 'factored' networks")
+    if thin_metres is not None and not (np.isfinite(thin_metres) and thin_metres > 0.0):
+        raise InputError(f"--thin-metres is {thin_metres:g}; expected a positive length, or none of this option to report every point")
     core = 1000.0 * (DEFAULT_CORE_KM if tile_km is None else tile_km)
     overlap = 0.25 * core if overlap_km is None else 1000.0 * overlap_km
     cover = cover_area(area, core, overlap, metadata.ellipsoid)
     network = NetworkMetadata(
         name=Path(place).name, body=metadata.body, frame=metadata.frame, epoch=metadata.epoch,
         semimajor_axis=metadata.semimajor_axis, flattening=metadata.flattening, cover=cover.to_mapping(), form=form,
-        parameters=width_of(["rpc"]), max_parameters=max_parameters,
+        parameters=width_of(["rpc"]), max_parameters=max_parameters, thinning=thin_metres or 0.0,
     )  # fmt: skip
     create_network(place, network)
     return Created(place, cover, network)

@@ -49,7 +49,7 @@ POINT_COLUMNS = (
 
 TEXTS = ("policy", "version", "frame", "epoch", "scope")
 NUMBERS = ("semimajor_axis", "flattening")
-LISTS = ("tiles", "blocks")
+LISTS = ("tiles", "blocks", "validity")
 
 _GROUP_VALUES = 2**23
 """Values of the triangle in one row group of a Parquet file: 64 MiB, so that a large covariance is never held twice."""
@@ -61,7 +61,7 @@ class ControlTable:
 
     Attributes
     ----------
-    columns : the arrays (n,) named in `POINT_COLUMNS`
+    columns : the arrays (n,) named in `POINT_COLUMNS`, and after them others that describe the points
     covariance : (3n, 3n), m2, joint, geocentric axes, point-major, symmetric
     metadata : the texts, numbers and lists of texts named in `TEXTS`, `NUMBERS` and `LISTS`
     """
@@ -71,7 +71,7 @@ class ControlTable:
     metadata: Metadata
 
     def __post_init__(self) -> None:
-        if tuple(self.columns) != POINT_COLUMNS:
+        if tuple(self.columns)[: len(POINT_COLUMNS)] != POINT_COLUMNS:
             raise InputError(f"table: columns are {', '.join(self.columns)}; expected {', '.join(POINT_COLUMNS)}")
         n = len(self.columns["point_id"])
         if self.covariance.shape != (3 * n, 3 * n):
@@ -125,10 +125,14 @@ def write_geojson(path: str | Path, table: ControlTable) -> None:
 
     The joint covariance is not in it: each point carries its own 3 x 3 covariance only.
     """
-    points = _point_columns(table)
-    places = np.column_stack([table.columns[c] for c in ("longitude", "latitude", "height")]).astype(np.float64, copy=False)
+    write_features(path, _point_columns(table), table.metadata)
+
+
+def write_features(path: str | Path, points: pa.Table, metadata: Metadata) -> None:
+    """Write the rows of a table as features at its longitude, latitude and height, with its columns as properties."""
+    places = np.column_stack([points[c].to_numpy() for c in ("longitude", "latitude", "height")])
     n = points.num_rows
-    coordinates = pa.FixedSizeListArray.from_arrays(pa.array(places.ravel()), 3)
+    coordinates = pa.FixedSizeListArray.from_arrays(pa.array(places.ravel(), pa.float64()), 3)
     features = pa.table(
         {
             "type": pa.repeat("Feature", n),
@@ -136,7 +140,7 @@ def write_geojson(path: str | Path, table: ControlTable) -> None:
             "properties": points.to_struct_array().combine_chunks() if n else pa.array([], pa.struct(list(points.schema))),
         }
     )
-    collection = {"type": "FeatureCollection", "metadata": dict(table.metadata), "features": features.to_pylist()}
+    collection = {"type": "FeatureCollection", "metadata": dict(metadata), "features": features.to_pylist()}
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(collection, ensure_ascii=False, allow_nan=False), encoding="utf-8")
 
@@ -314,8 +318,13 @@ def row_groups(points: int) -> Iterator[tuple[int, int]]:
 
 def _point_columns(table: ControlTable) -> pa.Table:
     """The point columns as an Arrow table with the types of the layout."""
-    types = {"point_id": pa.string(), "tile": pa.string(), "rays": pa.int64()}
-    return pa.table({k: pa.array(v, types.get(k, pa.float64())) for k, v in table.columns.items()})
+    types = dict.fromkeys(POINT_COLUMNS, pa.float64()) | {"point_id": pa.string(), "tile": pa.string(), "rays": pa.int64()}
+    return arrow_table(table.columns, types)
+
+
+def arrow_table(columns: Mapping[str, NDArray[Any]], types: Mapping[str, pa.DataType]) -> pa.Table:
+    """Columns as an Arrow table. Those of a type keep what is not a number; in the others it is no value."""
+    return pa.table({k: pa.array(v, types.get(k), from_pandas=k not in types) for k, v in columns.items()})
 
 
 def _arrays(columns: Mapping[str, NDArray[Any]], covariance: Array, metadata: Metadata) -> Arrays:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -65,6 +65,8 @@ class ControlSet:
         Version of the network, such as ``v12``.
     scope : str
         ``network`` when the answer equals that of the monolithic network, else ``tiles``.
+    validity : tuple of str
+        ``ID FROM/TO`` for every point of which a first or last day is known: an ISO 8601 interval, ``..`` where it is open.
 
     Raises
     ------
@@ -85,6 +87,7 @@ class ControlSet:
     version: str
     blocks: tuple[str, ...]
     scope: str
+    validity: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.ids)
@@ -179,6 +182,7 @@ class ControlSet:
         if outside.any():
             raise QueryError(f"subset: there is no point {chosen[outside][0]}; expected 0 to {len(self) - 1} ({len(self)} points)")
         rows = (3 * chosen.astype(np.intp)[:, None] + np.arange(3)).ravel()
+        here = set(self.ids[chosen].tolist())
         return replace(
             self,
             ids=self.ids[chosen],
@@ -186,6 +190,7 @@ class ControlSet:
             covariance=self.covariance[np.ix_(rows, rows)],
             tile_of_point=self.tile_of_point[chosen],
             rays=self.rays[chosen],
+            validity=tuple(dated for dated in self.validity if dated.rsplit(" ", 1)[0] in here),
         )
 
     def compact(self, family: str = AUTO, rank: int = 0, floor: float | None = None) -> CompactCovariance:
@@ -242,10 +247,14 @@ class ControlSet:
             "tiles": self.tiles,
             "blocks": self.blocks,
         }
+        if self.validity:
+            metadata = {**metadata, "validity": self.validity}
         return tables.ControlTable(columns, self.covariance, metadata)
 
-    def write(self, path: str | Path) -> None:
+    def write(self, path: str | Path, details: Mapping[str, NDArray[Any]] | None = None) -> None:
         """Write to a file of the format that its suffix names: ``.parquet``, ``.npz``, ``.geojson``, ``.csv`` or ``.gcp``.
+
+        ``details``: further columns (n,), such as those of `PointMetadata.details` for the same points.
 
         Raises
         ------
@@ -254,7 +263,8 @@ class ControlSet:
         InputError
             When the folder does not exist.
         """
-        tables.write_table(path, self.table())
+        table = self.table()
+        tables.write_table(path, replace(table, columns={**table.columns, **(details or {})}))
 
     def to_parquet(self, path: str | Path) -> None:
         """Write points, joint covariance and metadata; see `submin.formats.tables.write_parquet`."""

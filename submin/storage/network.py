@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import date
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,7 @@ from submin.errors import QueryError
 from submin.network.cell import Cell, widened_sums
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import GroundPart, SubMin
+from submin.network.thinning import reported_points
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import cross_covariance
 from submin.query.planner import (
@@ -31,10 +35,14 @@ from submin.query.planner import (
     points_of_tile,
     well_spread,
 )
+from submin.query.point_metadata import PointMetadata, metadata_of_points
 from submin.storage.arrays import group_of, read_record
+from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
+from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
+from submin.storage.validity import Validity, today
 from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
@@ -86,6 +94,7 @@ class Network:
         tile: str | None = None,
         policy: str = "auto",
         max_points: int | None = None,
+        on: date | None = None,
     ) -> ControlSet:
         """Control points with their joint covariance.
 
@@ -96,14 +105,18 @@ class Network:
         points : ids of points
         tile : name of a tile; alone, all points that it holds
         policy : ``auto``, ``tile``, ``ci``, ``bci``, ``split`` or ``rigorous`` (docs/accuracy.md)
-        max_points : at most so many, well spread and seen by many rays
+        max_points : at most so many, well spread and well determined
+        on : day on which points must be valid; default: today (UTC)
+
+        An area or a tile is answered by the points that the network reports: those that thinning leaves, and that are valid on the day.
+        Points that are asked for by their ids are answered whether it reports them or not (docs/points.md).
 
         Raises
         ------
         QueryError
-            When nothing or too much is asked, a policy, tile or point is unknown, or a box is not one.
+            When nothing or too much is asked, a policy, tile or point is unknown, a box is not one, or ``max_points`` is below 1.
         """
-        selections, number = self._selected(bbox, area, points, tile, max_points)
+        selections, number = self._selected(bbox, area, points, tile, max_points, today() if on is None else on)
         return self._control_set(answer(self, selections, policy, number))
 
     def export(
@@ -143,18 +156,18 @@ class Network:
         check_suffix(path)
         check_asked(family, rank, floor)
         if bbox is None and area is None and tile is None:
-            selections, number = all_points(self), None
+            selections, number = self._reported(all_points(self), today()), None
             if max_points is not None:
-                selections = well_spread(selections, max_points)
+                selections = well_spread(self, selections, max_points)
         else:
-            selections, number = self._selected(bbox, area, None, tile, max_points)
+            selections, number = self._selected(bbox, area, None, tile, max_points, today())
         check_size(sum(len(s.rows) for s in selections))  # before a joint covariance of that size is made
         control = self._control_set(answer(self, selections, policy, number))
         return write_compact(path, control, control.compact(family, rank, floor))
 
     def _selected(
         self, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None, points: Sequence[str] | NDArray[np.str_] | None,
-        tile: str | None, max_points: int | None,
+        tile: str | None, max_points: int | None, on: date,
     ) -> tuple[list[Selection], int | None]:  # fmt: skip
         """Points that are asked for, and the number of the tile that is named."""
         asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
@@ -183,9 +196,84 @@ class Network:
         if number is not None:
             held = set(self.cover.cells_held(number))
             selections = [s for s in selections if s.cell.number in held]
+        if points is None:
+            selections = self._reported(selections, on)
         if max_points is not None:
-            selections = well_spread(selections, max_points)
+            selections = well_spread(self, selections, max_points)
         return selections, number
+
+    def points(
+        self,
+        *,
+        bbox: tuple[float, float, float, float] | None = None,
+        area: BaseGeometry | None = None,
+        points: Sequence[str] | NDArray[np.str_] | None = None,
+        tile: str | None = None,
+    ) -> PointMetadata:
+        """What is known of points beside their coordinates: pending, thinned and retired ones too. Columns and units: docs/points.md.
+
+        Parameters
+        ----------
+        bbox, area, points, tile : exactly one of them, as of `query`; a point that its rays do not determine is where it is registered
+
+        Raises
+        ------
+        QueryError
+            When nothing or too much is asked, a tile or point is unknown, or a box is not one.
+        """
+        asked = [n for n, value in (("bbox", bbox), ("area", area), ("points", points), ("tile", tile)) if value is not None]
+        if len(asked) != 1:
+            raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, tile")
+        area = area if bbox is None else box_area(bbox)
+        if area is not None:
+            selections = points_in_area(self, area, every=True)
+        elif points is not None:
+            selections = self.named(points)
+        else:
+            assert tile is not None
+            selections = points_of_tile(self, self.cover.tile_number(tile), every=True)
+        snapshot = self._snapshot
+        found = metadata_of_points(self, selections, image_facts(snapshot), check_points(snapshot), snapshot.metadata.thinning)
+        if area is not None:
+            found = found.take(np.asarray(shapely.intersects_xy(area, found.geodetic[:, 0], found.geodetic[:, 1]), dtype=bool))
+        valid_from, valid_to, reason = self.validity.rows_of(found.ids)
+        return replace(
+            found, valid_from=valid_from, valid_to=valid_to, reason=reason, epoch=snapshot.metadata.epoch, version=self.version
+        )  # fmt: skip
+
+    def named(self, points: Sequence[str] | NDArray[np.str_]) -> list[Selection]:
+        """Points by their ids, determined or not.
+
+        Raises
+        ------
+        QueryError
+            When the network does not have one of them.
+        """
+        ids = np.unique(np.asarray(points, dtype=np.str_))
+        selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids), every=True)
+        if len(missing):
+            shown = f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+            raise QueryError(f"{len(missing)} of {len(ids)} points are not in the network: {shown}; expected ids of its points")
+        return selections
+
+    @cached_property
+    def validity(self) -> Validity:
+        """From when to when points are valid."""
+        return Validity.of(self._snapshot)
+
+    def left_by_thinning(self, cell: Cell) -> NDArray[np.bool_]:
+        """True (n,) for the points of a cell that thinning leaves in answers for areas and tiles."""
+        return reported_points(cell, self.cover, self._snapshot.metadata.thinning)
+
+    def _reported(self, selections: Sequence[Selection], on: date) -> list[Selection]:
+        """Those of some points that are not thinned, and valid on a day."""
+        if not self._snapshot.metadata.thinning and not len(self.validity):
+            return list(selections)
+        kept = []
+        for s in selections:
+            reported = self.left_by_thinning(s.cell) & self.validity.valid(s.cell.point_ids, on)
+            kept.append(Selection(s.cell, s.rows[reported[s.rows]]))
+        return [s for s in kept if len(s.rows)]
 
     def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
         """Those of some points that the network can answer for, by their cell."""
@@ -295,6 +383,7 @@ class Network:
             version=self.version,
             blocks=tuple(np.unique(blocks[found.images]).tolist()) if len(found.images) else (),
             scope="network" if found.network_wide else "tiles",
+            validity=self.validity.intervals(found.ids),
         )
 
 

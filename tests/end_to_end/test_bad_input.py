@@ -859,6 +859,31 @@ simply("tag that is taken", lambda w: ["tag", w.tagged(), "mine"])
 simply("tag like a version", lambda w: ["tag", w.fused, "v1"])
 simply("difference to an unknown version", lambda w: ["diff", w.fused, "v0", "v8"])
 
+# --- points: metadata, thinning, dates --------------------------------------------------------------------------------------------------
+
+
+def listing(w: World, *words: Any, out: str = "points.csv") -> list[Any]:
+    return ["points", w.fused, *words, "--out", w.folder / out]
+
+
+def retiring(w: World, *words: Any, ids: str = "P000000\n") -> list[Any]:
+    return ["retire", w.fused, "--points", w.write("ids.txt", ids), *words]
+
+
+simply("thinning to squares without a side", lambda w: ["create", w.new, *BOX, "--thin-metres", 0])
+simply("details of an answer that is not written", lambda w: ["query", w.fused, *BOX, "--details"])
+simply("query on a day that is none", lambda w: ["query", w.fused, *BOX, "--on", "31.5.2026"])
+simply("metadata of no points", lambda w: listing(w))
+simply("metadata asked for in two ways", lambda w: listing(w, *BOX, "--tile", "r000c000"))
+simply("metadata of unknown points", lambda w: listing(w, "--points", w.write("ids.txt", "P000000\nP1\n")))
+simply("metadata of an unknown status", lambda w: listing(w, *BOX, "--status", "good"))
+simply("metadata of unknown format", lambda w: listing(w, *BOX, out="points.npz"))
+simply("metadata to a folder that does not exist", lambda w: listing(w, *BOX, out="nowhere/points.csv"))
+simply("retirement of unknown points", lambda w: retiring(w, "--valid-to", "2026-05-31", ids="P000000\nP1\n"))
+simply("retirement on a day that is none", lambda w: retiring(w, "--valid-to", "2026-02-30"))
+simply("retirement without a day", lambda w: retiring(w, "--reason", "quarry"))
+simply("retirement before the first day", lambda w: retiring(w, "--valid-from", "2026-06-01", "--valid-to", "2026-05-31"))
+
 
 @case("correlated control")
 def _(w: World) -> list[Any]:
