@@ -33,6 +33,7 @@ def describe(network: Network) -> dict[str, Any]:
         "blocks": len(ledger.fused()),
         "control_points": len(ledger.control_points()),
         "tiles": len(snapshot.tile_numbers()),
+        "tiles_of_the_area": network.cover.tile_count,
         "cells": len(cells),
         "ce90_median": float(np.median(accuracy.ce90)) if len(accuracy.ids) else float("nan"),
         "le90_median": float(np.median(accuracy.le90)) if len(accuracy.ids) else float("nan"),
