@@ -424,9 +424,12 @@ simply("area with swapped axes", lambda w: w.area([[y, x] for x, y in RING]))
 simply("area off the globe", lambda w: w.area([[x, y + 100] for x, y in RING]))
 simply("area with a coordinate that is not finite", lambda w: w.area([[99, float("nan")], *RING[1:]]))
 simply("overlap as wide as the core", lambda w: ["create", w.new, *BOX, "--tile-km", 50, "--overlap-km", 50])
+simply("overlap wider than the core", lambda w: ["create", w.new, *BOX, "--tile-km", 50, "--overlap-km", 75])
 simply("negative overlap", lambda w: ["create", w.new, *BOX, "--overlap-km", -1])
 simply("tiles without size", lambda w: ["create", w.new, *BOX, "--tile-km", 0])
 simply("a billion tiles", lambda w: ["create", w.new, "--bbox", -170, -60, 170, 60, "--tile-km", 0.3, "--overlap-km", 0.1])
+simply("ten million tiles", lambda w: [*w.area([[100, 0], [110, 0], [110, 10], [100, 10], [100, 0]]), "--tile-km", 0.347])
+simply("area around the globe", lambda w: ["create", w.new, "--bbox", -180, -60, 180, 60])
 simply("tiles too small to count", lambda w: ["create", w.new, *BOX, "--tile-km", 1e-307, "--overlap-km", 0])
 
 
@@ -448,7 +451,8 @@ def _(w: World) -> list[Any]:
 def _(w: World) -> list[Any]:
     columns = w.columns("images")
     del columns["geometry"]
-    w.put("images", columns)
+    blind = [json.dumps(json.loads(camera) | {"LINE_NUM_COEFF": [0.0] * 20}) for camera in columns["camera"]]
+    w.put("images", columns | {"camera": blind})
     return ["create", w.new, "--fit", w.catalogue]
 
 
