@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -148,6 +149,8 @@ def test_the_constraint_of_a_file_is_removed(tmp_path: Path, kind: str, a_priori
     error = found - truth
     assert error @ free @ error < (0.1 if share > 0.9 else 1e-3) ** 2  # standard deviations; coordinates are printed to 10 nm
     assert made.constraint == "removed" and 0.0 < made.constraint_share < 1.0
+    metadata = pq.read_schema(tmp_path / "control.parquet").metadata
+    assert (metadata[b"constraint"], metadata[b"epoch"], metadata[b"source"]) == (b"removed", b"2017-10-25T12:00:00", b"solution.snx")
     assert looser(covariance, true_covariance) > 1.0  # as the file stands it claims more
 
 
@@ -183,7 +186,7 @@ def test_a_free_network_is_refused_unless_its_constraint_is_kept(tmp_path: Path)
         import_lines(tmp_path, lines)
     assert not (tmp_path / "control.parquet").exists()
     made = import_lines(tmp_path, lines, keep_constraints=True)
-    assert made.constraint == "kept" and "the a priori constraint is kept" in made.notes[-1]
+    assert made.constraint == "kept" and "they are kept: control of this file is as accurate" in made.notes[-1]
 
 
 def test_a_constraint_that_knows_more_than_the_estimate_is_none_of_it() -> None:
