@@ -37,6 +37,7 @@ def describe(network: Network) -> dict[str, Any]:
         "blocks": len(ledger.fused()),
         "control_points": len(ledger.control_points()),
         "tiles": len(snapshot.tile_numbers()),
+        "tiles_of_the_area": network.cover.tile_count,
         "cells": len(cells),
         "ce90_median": float(np.median(accuracy.ce90[reported])) if reported.any() else float("nan"),
         "le90_median": float(np.median(accuracy.le90[reported])) if reported.any() else float("nan"),

@@ -37,7 +37,7 @@ def query(
         bool, typer.Option("--details", help="Columns status, first_block, last_block, blocks, convergence and licences too.")
     ] = False,
     output: Annotated[
-        Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")
+        Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson, .csv or .gcp.")
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, show
+from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, counted, show
 
 app = typer.Typer()
 control_app = typer.Typer(no_args_is_help=True, help="Surveyed control points.")
@@ -59,8 +59,8 @@ def create(
     made = make(network, area, metadata, tile_km, overlap_km, form, max_parameters, thin_metres)
     cover = made.cover
     thinned = "" if thin_metres is None else f", one point reported in each square of {thin_metres:g} m"
-    show(made.to_json(), as_json, f"{network}: {cover.rows} x {cover.columns} tiles, cores of {cover.core / 1000:g} km, "
-         f"overlap {cover.overlap / 1000:g} km, frame {metadata.frame}{thinned}")  # fmt: skip
+    show(made.to_json(), as_json, f"{network}: {counted(cover.tile_count, 'tile')} ({cover.rows} rows, {cover.columns} columns), "
+         f"cores of {cover.core / 1000:g} km, overlap {cover.overlap / 1000:g} km, frame {metadata.frame}{thinned}")  # fmt: skip
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""Tables of points with their joint covariance: Parquet, NumPy archive, GeoJSON and CSV (layout: docs/interface.md, "Query output").
+"""Tables of points with their joint covariance: Parquet, NumPy archive, GeoJSON, CSV and GCP (layout: docs/interface.md, "Query output").
 
 One row a point with the columns `POINT_COLUMNS`: geocentric metres, degrees and ellipsoidal height, the covariance of the point in its
 local axes (m2), CE90 and LE90 (m), owner tile and number of rays. The joint covariance is geocentric, m2, point-major.
@@ -11,6 +11,7 @@ file          joint covariance                                        metadata
 ``.npz``      array ``covariance`` (3n, 3n)                           arrays without dimension, lists (k,)
 ``.geojson``  no                                                      member ``metadata``
 ``.csv``      no                                                      no
+``.gcp``      no                                                      no
 ============  ======================================================  =====================================
 
 A file is written under a temporary name in its folder and then renamed: a write that fails leaves what was there before.
@@ -78,7 +79,7 @@ class ControlTable:
 
 
 def write_table(path: str | Path, table: ControlTable) -> None:
-    """Write a table in the format that the suffix of the path names: ``.parquet``, ``.npz``, ``.geojson`` or ``.csv``.
+    """Write a table in the format that the suffix of the path names: ``.parquet``, ``.npz``, ``.geojson``, ``.csv`` or ``.gcp``.
 
     Raises
     ------
@@ -153,7 +154,32 @@ def write_csv(path: str | Path, table: ControlTable) -> None:
         pa_csv.write_csv(_point_columns(table), str(temporary))
 
 
-_WRITERS = {".parquet": write_parquet, ".npz": write_npz, ".geojson": write_geojson, ".csv": write_csv}
+def write_gcp(path: str | Path, table: ControlTable) -> None:
+    """Write ground control points as text, as the bundle adjustment of the Ames Stereo Pipeline takes them.
+
+    A line a point: number, latitude, longitude (degrees), ellipsoidal height, and the standard deviations of geocentric x, y, z (m), with
+    blanks between them. Whoever measures a point in an image appends name, column, row and their sigmas. The numbers are the point ids
+    where all of these are whole numbers, else 1, 2, ... in the order of the table.
+
+    The format takes x, y and z as independent. So that they claim no more accuracy than the covariance P of the point, they are those of
+    ``lambda diag(P)``, lambda the greatest eigenvalue of its correlations (1 to 3): no combination of them is below that of P. What is
+    correlated between points is not in the file.
+    """
+    ids = [str(v) for v in table.columns["point_id"]]
+    whole = all(v.isdecimal() and v.isascii() and v == str(int(v)) for v in ids)
+    n = len(ids)
+    own = table.covariance.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+    sigma = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    greatest = np.linalg.eigvalsh(own / (sigma[:, :, None] * sigma[:, None, :]))[:, -1]
+    sigma = sigma * np.sqrt(greatest)[:, None] * (1.0 + 5e-6)  # six digits are printed, none of them below
+    places = np.column_stack([table.columns[c] for c in ("latitude", "longitude", "height")])
+    rows = zip(ids if whole else range(1, n + 1), places.tolist(), sigma.tolist(), strict=True)
+    lines = [f"{number} {a:.11f} {b:.11f} {h:.5f} {x:.6g} {y:.6g} {z:.6g}" for number, (a, b, h), (x, y, z) in rows]
+    with replacing(path) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
+
+
+_WRITERS = {".parquet": write_parquet, ".npz": write_npz, ".geojson": write_geojson, ".csv": write_csv, ".gcp": write_gcp}
 
 
 def read_parquet(path: str | Path) -> Arrays:

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin import accuracy
+from submin.correlation.compact import AUTO, CompactCovariance, condense
 from submin.errors import InputError, QueryError
 from submin.formats import tables
-from submin.geodesy import Ellipsoid, geocentric_to_geodetic, local_axes, rotate_covariance
+from submin.geodesy import Ellipsoid, common_axes, geocentric_to_geodetic, local_axes, rotate_covariance
 
 Array = NDArray[np.float64]
 
@@ -192,6 +193,27 @@ class ControlSet:
             validity=tuple(dated for dated in self.validity if dated.rsplit(" ", 1)[0] in here),
         )
 
+    def compact(self, family: str = AUTO, rank: int = 0, floor: float | None = None) -> CompactCovariance:
+        """The joint covariance condensed to each point's own covariance and correlation functions, with the factor that makes it a bound.
+
+        `submin.correlation.expand` makes a joint covariance of it again, which is nowhere smaller than that of the set.
+
+        Parameters
+        ----------
+        family : name of a family of correlation functions (docs/correlation.md), or ``auto``: the one that enlarges least
+        rank : number of vectors kept beside the functions: 3n numbers each, and the covariance is enlarged less
+        floor : metres from which on points are uncorrelated at the latest, but for the vectors; for families with zero floor
+
+        Raises
+        ------
+        InputError
+            When the family is unknown or not positive definite in space, there are too few or too many points, or rank or floor are out
+            of range.
+        NumericalError
+            When a point's own covariance is not positive definite.
+        """
+        return condense(self.covariance, self.geocentric, common_axes(self.geocentric, self.ellipsoid), family, rank, floor)
+
     def table(self) -> tables.ControlTable:
         """Columns, joint covariance and metadata as they are written to files."""
         local, geodetic = self.local_covariance, self.geodetic
@@ -230,7 +252,7 @@ class ControlSet:
         return tables.ControlTable(columns, self.covariance, metadata)
 
     def write(self, path: str | Path, details: Mapping[str, NDArray[Any]] | None = None) -> None:
-        """Write to a file of the format that its suffix names: ``.parquet``, ``.npz``, ``.geojson`` or ``.csv``.
+        """Write to a file of the format that its suffix names: ``.parquet``, ``.npz``, ``.geojson``, ``.csv`` or ``.gcp``.
 
         ``details``: further columns (n,), such as those of `PointMetadata.details` for the same points.
 

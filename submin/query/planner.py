@@ -91,6 +91,12 @@ def points_in_area(source: NetworkSource, area: BaseGeometry, every: bool = Fals
     return [s for s in selections if len(s.rows)]
 
 
+def all_points(source: NetworkSource) -> list[Selection]:
+    """All determined points of a network."""
+    cells = [source.cell(number) for number in source.cell_numbers()]
+    return [s for s in (Selection(cell, np.flatnonzero(_wanted(cell, every=False))) for cell in cells) if len(s.rows)]
+
+
 def points_of_tile(source: NetworkSource, number: int, every: bool = False) -> list[Selection]:
     """All determined points that a tile holds; with ``every`` also those of fewer than two rays."""
     existing = set(source.cell_numbers())

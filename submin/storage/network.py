@@ -16,6 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
+from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
 from submin.network.cell import Cell, widened_sums
 from submin.network.network_image import NetworkImage, image_set
@@ -23,10 +24,21 @@ from submin.network.sub_min import GroundPart, SubMin
 from submin.network.thinning import reported_points
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import cross_covariance
-from submin.query.planner import Answer, Selection, answer, determined_parts, points_in_area, points_named, points_of_tile, well_spread
+from submin.query.planner import (
+    Answer,
+    Selection,
+    all_points,
+    answer,
+    determined_parts,
+    points_in_area,
+    points_named,
+    points_of_tile,
+    well_spread,
+)
 from submin.query.point_metadata import PointMetadata, metadata_of_points
 from submin.storage.arrays import group_of, read_record
 from submin.storage.check_points import check_points
+from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
@@ -104,6 +116,60 @@ class Network:
         QueryError
             When nothing or too much is asked, a policy, tile or point is unknown, a box is not one, or ``max_points`` is below 1.
         """
+        selections, number = self._selected(bbox, area, points, tile, max_points, today() if on is None else on)
+        return self._control_set(answer(self, selections, policy, number))
+
+    def export(
+        self,
+        path: str | Path,
+        *,
+        bbox: tuple[float, float, float, float] | None = None,
+        area: BaseGeometry | None = None,
+        tile: str | None = None,
+        policy: str = "auto",
+        max_points: int | None = None,
+        family: str = AUTO,
+        rank: int = 0,
+        floor: float | None = None,
+    ) -> CompactControl:
+        """Write control points with a compact joint covariance: 3 x 3 blocks and correlation functions (docs/correlation.md).
+
+        Parameters
+        ----------
+        path : file to write, ``.parquet``
+        bbox, area, tile, policy, max_points : which points, as in `query`; without any of the first three all points
+        family, rank, floor : as in `ControlSet.compact`
+
+        Returns
+        -------
+        CompactControl
+            What `read_compact` reads from the file.
+
+        Raises
+        ------
+        QueryError
+            As `query` does.
+        InputError
+            When the family is unknown, there are too few or too many points, rank or floor are out of range, or the file cannot be
+            written; nothing is written then.
+        """
+        check_suffix(path)
+        check_asked(family, rank, floor)
+        if bbox is None and area is None and tile is None:
+            selections, number = self._reported(all_points(self), today()), None
+            if max_points is not None:
+                selections = well_spread(self, selections, max_points)
+        else:
+            selections, number = self._selected(bbox, area, None, tile, max_points, today())
+        check_size(sum(len(s.rows) for s in selections))  # before a joint covariance of that size is made
+        control = self._control_set(answer(self, selections, policy, number))
+        return write_compact(path, control, control.compact(family, rank, floor))
+
+    def _selected(
+        self, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None, points: Sequence[str] | NDArray[np.str_] | None,
+        tile: str | None, max_points: int | None, on: date,
+    ) -> tuple[list[Selection], int | None]:  # fmt: skip
+        """Points that are asked for, and the number of the tile that is named."""
         asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
         if len(asked) > 1 or (not asked and tile is None):
             raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
@@ -131,10 +197,10 @@ class Network:
             held = set(self.cover.cells_held(number))
             selections = [s for s in selections if s.cell.number in held]
         if points is None:
-            selections = self._reported(selections, today() if on is None else on)
+            selections = self._reported(selections, on)
         if max_points is not None:
             selections = well_spread(self, selections, max_points)
-        return self._control_set(answer(self, selections, policy, number))
+        return selections, number
 
     def points(
         self,
