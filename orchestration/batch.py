@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,8 +14,8 @@ from orchestration.executors import Executor
 from orchestration.progress import Reporter
 from orchestration.tasks import BlockRays, FlaggedImage, adjust_blocks
 from submin.geodesy import geocentric_to_geodetic
-from submin.network.network_image import NetworkImage
 from submin.network.registration import LooseRays, together
+from submin.storage.block_images import network_images as network_images
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import enter_check_points
 from submin.storage.control_blocks import control_point_of
@@ -170,14 +169,6 @@ def _inside_when_swapped(ids: NDArray[np.str_], move: Move) -> bool:
     possible = np.abs(geodetic[:, 0]) <= 90.0
     inside = possible & ~move.cover.outside(geodetic[:, 1], np.where(possible, geodetic[:, 0], 0.0))
     return 2 * int(inside.sum()) > len(inside)
-
-
-def network_images(block: Block) -> tuple[NetworkImage, ...]:
-    """The images of a block of a catalogue as a network has them."""
-    a_priori = "" if block.a_priori is None else json.dumps(block.a_priori.to_mapping(), sort_keys=True)
-    return tuple(
-        NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, a_priori) for i in block.images
-    )
 
 
 def block_rays(block: Block) -> BlockRays:

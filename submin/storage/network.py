@@ -36,7 +36,11 @@ from submin.query.planner import (
     well_spread,
 )
 from submin.query.point_metadata import PointMetadata, metadata_of_points
+from submin.query.with_block import BlockRays, TileWithBlock, with_block
+from submin.sensors import width_of
 from submin.storage.arrays import group_of, read_record
+from submin.storage.block_images import network_images
+from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.image_facts import image_facts
@@ -117,7 +121,7 @@ class Network:
             When nothing or too much is asked, a policy, tile or point is unknown, a box is not one, or ``max_points`` is below 1.
         """
         selections, number = self._selected(bbox, area, points, tile, max_points, today() if on is None else on)
-        return self._control_set(answer(self, selections, policy, number))
+        return self.control_set(answer(self, selections, policy, number))
 
     def export(
         self,
@@ -162,7 +166,7 @@ class Network:
         else:
             selections, number = self._selected(bbox, area, None, tile, max_points, today())
         check_size(sum(len(s.rows) for s in selections))  # before a joint covariance of that size is made
-        control = self._control_set(answer(self, selections, policy, number))
+        control = self.control_set(answer(self, selections, policy, number))
         return write_compact(path, control, control.compact(family, rank, floor))
 
     def _selected(
@@ -366,7 +370,8 @@ class Network:
         self._images.update(zip(unread, self._snapshot.images(unread), strict=True))
         return image_set([self._images[int(row)] for row in rows], self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
 
-    def _control_set(self, found: Answer) -> ControlSet:
+    def control_set(self, found: Answer) -> ControlSet:
+        """An answer as users get it; images behind it that are not in the network have no block there."""
         metadata, cover = self._snapshot.metadata, self.cover
         blocks = self._snapshot.image_columns(["block_id"])["block_id"] if len(found.images) else np.empty(0, dtype="U1")
         return ControlSet(
@@ -381,7 +386,7 @@ class Network:
             tile_of_point=np.array([cover.tile_name(t) for t in found.owner], dtype=np.str_),
             rays=found.rays,
             version=self.version,
-            blocks=tuple(np.unique(blocks[found.images]).tolist()) if len(found.images) else (),
+            blocks=tuple(np.unique(blocks[found.images[found.images < len(blocks)]]).tolist()),
             scope="network" if found.network_wide else "tiles",
             validity=self.validity.intervals(found.ids),
         )
@@ -405,6 +410,74 @@ class TileView:
     def covariance(self, ids: Sequence[str]) -> Array:
         """Joint covariance (3n, 3n) of points, geocentric square metres, in the order of their ids ascending, from this sub-MIN alone."""
         return self.query(ids).covariance
+
+    def with_block(self, block: Block) -> TilePreview:
+        """What a block that is not in the network would bring to this sub-MIN alone: fused in memory, nothing is written.
+
+        Its rays are taken as they are, where a run would judge them; points that the network holds in other tiles only take no part.
+
+        Raises
+        ------
+        QueryError
+            When an image of the block is in the network already, or none of its rays falls into the tile.
+        """
+        images = network_images(block)
+        opened = self._network
+        width = width_of(image.sensor for image in images)
+        if width > opened.snapshot.metadata.parameters:
+            opened = Network(opened.snapshot.place, opened.version, width)
+        names = opened.snapshot.image_columns(["image_id"])["image_id"] if opened.snapshot.image_count() else np.empty(0, dtype="U1")
+        twice = [image.image_id for image in images if image.image_id in names]
+        if twice:
+            raise QueryError(f"image {twice[0]} of block {block.block_id} is in the network already; expected a block that is not")
+        ids = np.unique(block.point_ids)
+        rays = BlockRays(
+            image_set(images, opened.snapshot.metadata.ellipsoid, opened.snapshot.metadata.parameters), block.point_ids, block.image,
+            np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line]),
+        )  # fmt: skip
+        elsewhere = ids[opened.snapshot.candidate_cells(ids) >= 0]
+        return TilePreview(opened, with_block(opened, self._number, rays, elsewhere, opened.snapshot.image_count()))
+
+
+class TilePreview:
+    """One sub-MIN with a block in it that is not in the network."""
+
+    def __init__(self, network: Network, source: TileWithBlock) -> None:
+        self._network, self._source = network, source
+
+    @property
+    def chi_square(self) -> float:
+        """By how much the block adds to the weighted squares of the tile: chi-square when block and tile agree."""
+        return self._source.fused.chi_square
+
+    @property
+    def redundancy(self) -> int:
+        """Degrees of freedom of ``chi_square``."""
+        return self._source.fused.redundancy
+
+    @property
+    def rank(self) -> int:
+        """Directions in which the block changes what is known of the images."""
+        return self._source.fused.rank
+
+    def query(self, ids: Sequence[str] | None = None) -> ControlSet:
+        """Control points of this sub-MIN with the block: those named, or all that the tile and the block determine.
+
+        Raises
+        ------
+        QueryError
+            When a point named is not in the tile, or not determined.
+        """
+        selections = points_of_tile(self._source, self._source.tile)
+        if ids is not None:
+            wanted = np.unique(np.asarray(ids, dtype=np.str_))
+            selections = [Selection(s.cell, s.rows[np.isin(s.cell.point_ids[s.rows], wanted)]) for s in selections]
+            selections = [s for s in selections if len(s.rows)]
+            found = np.concatenate([s.cell.point_ids[s.rows] for s in selections] or [wanted[:0]])
+            missing = np.setdiff1d(wanted, found)
+            if len(missing):
+                raise QueryError(f"{len(missing)} of {len(wanted)} points are not determined in the tile, {missing[0]} among them")
+        return self._network.control_set(answer(self._source, selections, "tile", self._source.tile))
 
 
 def box_area(bbox: tuple[float, float, float, float]) -> BaseGeometry:

@@ -11,8 +11,8 @@ import zarr
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import Sums
-from submin.adjustment.estimation import fill_symmetric
 from submin.adjustment.rays import Rays
+from submin.adjustment.symmetric import fill_symmetric
 from submin.errors import StoreError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, widened
