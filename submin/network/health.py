@@ -11,7 +11,7 @@ import scipy.linalg as la
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import LinearRays, Sums
-from submin.adjustment.estimation import fill_symmetric
+from submin.adjustment.symmetric import fill_symmetric
 from submin.network.sub_min import SubMin
 
 Array = NDArray[np.float64]
