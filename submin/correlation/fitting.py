@@ -121,7 +121,7 @@ def least_inflation(
     shorter[1::width] -= np.log(6.0)  # correlations that fall sooner promise less of what is common, and more of differences
     at = min((np.clip(start, *np.array(limits).T) for start in (begin, shorter)), key=cost)
     for most in steps:
-        options = {"maxfev": most * min(width, 3), "xatol": 1e-3, "fatol": 1e-4, "adaptive": True, "initial_simplex": _simplex(at, limits)}
+        options = {"maxfev": most * min(width, 3), "xatol": 1e-2, "fatol": 1e-3, "adaptive": True, "initial_simplex": _simplex(at, limits)}
         at = so.minimize(cost, at, method="Nelder-Mead", bounds=limits, options=options).x
     return tuple(search.function(part) for part in at.reshape(COMPONENTS, width))
 
