@@ -457,7 +457,7 @@ class TilePreview:
 
     @property
     def rank(self) -> int:
-        """Directions in which the block changes what is known of the images."""
+        """Directions, at most, in which the block changes what is known of the images."""
         return self._source.fused.rank
 
     def query(self, ids: Sequence[str] | None = None) -> ControlSet:
