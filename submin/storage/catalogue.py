@@ -169,8 +169,8 @@ class Catalogue:
         path = table_path(self.path, kind)
         return None if path is None else read_point_table(path, _COVARIANCE_OF[kind])
 
-    def validate(self) -> CatalogueSummary:
-        """Scan the whole catalogue for structural errors.
+    def validate(self, *, measured: bool = True) -> CatalogueSummary:
+        """Scan the whole catalogue for structural errors; with ``measured`` that it holds no measurement is one.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class Catalogue:
                 read_footprint(image.footprint, f"{path}: row {row}: geometry of image {image.image_id}")
         path = required_path(self.path, "measurements")
         rays = sum(len(self._image_index(block_id, row, table, path)) for block_id, row, table in _runs(path))
-        if not rays:
+        if measured and not rays:
             raise CatalogueError(f"{path}: holds no measurements; expected at least one row")
         for kind in _COVARIANCE_OF:
             self.points(kind)
