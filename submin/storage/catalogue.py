@@ -191,21 +191,21 @@ class Catalogue:
         path = table_path(self.path, OBSERVATIONS)
         return iter(()) if path is None else read_clusters(path, self.metadata.ellipsoid, frozenset(self.block_ids))
 
-    def validate(self) -> CatalogueSummary:
-        """Scan the whole catalogue for structural errors.
+    def validate(self, *, measured: bool = True) -> CatalogueSummary:
+        """Scan the whole catalogue for structural errors; with ``measured`` that it holds no measurement is one.
 
         Raises
         ------
         CatalogueError
             The first one: file, row, value, what was expected.
         """
-        rays = self._validate_images() if self.images else 0
+        rays = self._validate_images(measured) if self.images else 0
         for kind in _COVARIANCE_OF:
             self.points(kind)
         sizes = [len(cluster) for cluster in self.observations()]
         return CatalogueSummary(self.block_count, len(self.images), rays, len(sizes), sum(sizes))
 
-    def _validate_images(self) -> int:
+    def _validate_images(self, measured: bool) -> int:
         """Scan images and measurements; the number of rays."""
         path = required_path(self.path, "images")
         for row, image in enumerate(self.images, start=1):
@@ -217,7 +217,7 @@ class Catalogue:
                 read_footprint(image.footprint, f"{path}: row {row}: geometry of image {image.image_id}")
         path = required_path(self.path, "measurements")
         rays = sum(len(self._image_index(block_id, row, table, path)) for block_id, row, table in _runs(path))
-        if not rays:
+        if measured and not rays:
             raise CatalogueError(f"{path}: holds no measurements; expected at least one row")
         return rays
 

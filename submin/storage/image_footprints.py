@@ -15,11 +15,9 @@ from submin.sensors import SENSORS, sensor_named
 from submin.sensors.footprint import footprints as seen_by
 from submin.storage.catalogue import Catalogue, read_footprint
 from submin.storage.catalogue_schema import ImageRecord
-from submin.tiling.footprints import Shapes, middles
+from submin.tiling.footprints import EMPTY, Shapes, middles
 
 Array = NDArray[np.float64]
-
-EMPTY = shapely.Polygon()
 
 
 def image_footprints(catalogue: Catalogue, path: Path) -> Shapes:

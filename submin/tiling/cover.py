@@ -367,16 +367,19 @@ class Cover:
 
     def leaves(self) -> Iterator[int]:
         """Tiles of all cores, those whose outline does not meet the area too."""
-        split = set(self.splits)
+        return (leaf for tile in range(self._base) for leaf in self.leaves_of(tile))
 
-        def leaves(tile: int) -> Iterator[int]:
-            if tile not in split:
-                yield tile
-            else:
-                for quarter in self.quarters(tile):
-                    yield from leaves(quarter)
+    def leaves_of(self, tile: int) -> Iterator[int]:
+        """The tile, or the tiles into which it was split."""
+        if tile not in self._split:
+            yield tile
+        else:
+            for quarter in self.quarters(tile):
+                yield from self.leaves_of(quarter)
 
-        return (leaf for tile in range(self._base) for leaf in leaves(tile))
+    @cached_property
+    def _split(self) -> frozenset[int]:
+        return frozenset(self.splits)
 
     @cached_property
     def _of_area(self) -> Codes:

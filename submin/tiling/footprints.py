@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Shapes = NDArray[np.object_]
 
+EMPTY = shapely.Polygon()
 BEYOND = 1e9
 """Metres: farther than any place of an equal-area plane."""
 
@@ -78,7 +79,7 @@ def in_plane(footprints: Shapes, cover: Cover) -> Shapes:
     """Footprints in the plane of a cover, metres; empty ones, and those that reach the place opposite its middle, are empty."""
     flat = shapely.transform(footprints, lambda at: np.column_stack(cover.plane(at[:, 0], at[:, 1])))
     at, of = corners(flat)
-    flat[np.unique(of[~np.isfinite(at).all(axis=1)])] = shapely.Polygon()
+    flat[np.unique(of[~np.isfinite(at).all(axis=1)])] = EMPTY
     broken = ~shapely.is_valid(flat)
     flat[broken] = [polygons_of(shape) for shape in shapely.make_valid(flat[broken])]
     return np.asarray(flat, dtype=np.object_)
@@ -92,8 +93,11 @@ class FootprintIndex:
 
     @classmethod
     def of(cls, footprints: Shapes, cover: Cover) -> FootprintIndex:
-        """Index of footprints in longitude and latitude."""
-        return cls(shapely.STRtree(in_plane(footprints, cover)))
+        """Index of footprints in longitude and latitude; one that is not known (None) meets every tile."""
+        unknown = shapely.is_missing(footprints)
+        flat = in_plane(np.where(unknown, EMPTY, footprints), cover)
+        flat[unknown] = shapely.box(-BEYOND, -BEYOND, BEYOND, BEYOND)
+        return cls(shapely.STRtree(flat))
 
     def met_by(self, tiles: Rows, cover: Cover) -> tuple[Rows, Rows]:
         """Pairs (p,) of tile and footprint that meet, by tile and then footprint; tiles on the rim reach to infinity, as their cores do."""
