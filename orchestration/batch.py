@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import zarr
@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from orchestration.change import Move, finish, place, settle, take_points
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
-from orchestration.tasks import BlockRays, FlaggedImage, adjust_blocks
+from orchestration.tasks import BlockRays, FlaggedImage, Gate, adjust_blocks
 from submin.geodesy import geocentric_to_geodetic
+from submin.network.innovation import REJECTED, BlockTest
 from submin.network.registration import LooseRays, together
 from submin.storage.block_images import network_images as network_images
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import enter_check_points
 from submin.storage.control_blocks import control_point_of
-from submin.storage.ledger import Entry, Ledger
+from submin.storage.ledger import UNTESTED, Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 
 BLOCKS_A_TASK = 8
@@ -36,13 +37,22 @@ class Rejected:
 
 
 @dataclass(frozen=True)
+class Doubtful:
+    """A block that was fused though it agrees with the network as few good ones do, its test, and the number of the version."""
+
+    block_id: str
+    test: BlockTest
+    against: int
+
+
+@dataclass(frozen=True)
 class BatchResult:
     """What a batch did.
 
     Attributes
     ----------
     version : number of the committed version
-    fused : ids of the fused blocks; rejected : the others
+    fused : ids of the fused blocks; rejected : the others; doubtful : fused ones that agree with the network as few good ones do
     flagged : images whose camera the judged tiles find bad
     tiles : that were judged; unsettled : tiles whose judgement did not come to rest (their rays are used as last judged)
     """
@@ -50,6 +60,7 @@ class BatchResult:
     version: int
     fused: tuple[str, ...]
     rejected: tuple[Rejected, ...]
+    doubtful: tuple[Doubtful, ...]
     flagged: tuple[FlaggedImage, ...]
     tiles: tuple[int, ...]
     unsettled: tuple[int, ...]
@@ -57,11 +68,12 @@ class BatchResult:
 
 def fuse_batch(
     where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter,
-    check_points: NDArray[np.str_] | None = None,
+    innovation: float = REJECTED, check_points: NDArray[np.str_] | None = None,
 ) -> BatchResult:  # fmt: skip
     """Fuse blocks that the ledger of a version has let through; ``rejected`` ones are entered in the ledger in the same commit.
 
-    So are the ids of ``check_points``, where blocks are fused.
+    So are the ids of ``check_points``, where blocks are fused. A block that contradicts that version as a whole is rejected when one of
+    fewer than ``innovation`` good blocks would (0: none is).
 
     Raises
     ------
@@ -70,48 +82,78 @@ def fuse_batch(
     """
     session, base = begin_change(where, version)
     refused = list(rejected)
-    accepted = _stage_one(blocks, base, executor, reporter, refused)
+    accepted, tests = _stage_one(blocks, base, executor, reporter, refused, innovation)
     blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, base, refused)
     ledger = Ledger.of(base)
     unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
     if not blocks and not unsaid:
-        return BatchResult(base.number, (), tuple(refused), (), (), ())  # the same command again writes nothing
+        return BatchResult(base.number, (), tuple(refused), (), (), (), ())  # the same command again writes nothing
     settled = settle(session, base, move, executor, reporter)
     version += 1
     lost = settled.rejected[base.image_count() :]
     of_block = np.repeat(np.arange(len(blocks)), [len(block.images) for block in blocks])
     rejected_rays = np.bincount(of_block, weights=lost, minlength=len(blocks)).astype(np.int64).tolist()
     entries = [
-        Entry(b.block_id, b.content_hash(), "fused", "", version, len(b.images), len(b), n)
+        Entry(b.block_id, b.content_hash(), "fused", "", version, len(b.images), len(b), n, *_tested(tests.get(b.block_id), base.number))
         for b, n in zip(blocks, rejected_rays, strict=True)
     ]  # fmt: skip
-    entries += [Entry(r.block_id, "", "rejected", r.reason, version) for r in unsaid]
+    entries += [
+        Entry(r.block_id, "", "rejected", r.reason, version, 0, 0, 0, *_tested(tests.get(r.block_id), base.number)) for r in unsaid
+    ]  # fmt: skip
     if blocks and check_points is not None:
         enter_check_points(zarr.open_group(session.store, mode="r+"), base, check_points)
     records = [image for block in blocks for image in block.images]
     finish(session, base, move, settled, records, entries, f"{len(blocks)} blocks fused, {len(refused)} rejected")
+    doubtful = tuple(
+        Doubtful(b.block_id, tests[b.block_id], base.number) for b in blocks if b.block_id in tests and tests[b.block_id].doubtful
+    )
     return BatchResult(
-        version, tuple(block.block_id for block in blocks), tuple(refused), settled.flagged,
+        version, tuple(block.block_id for block in blocks), tuple(refused), doubtful, settled.flagged,
         tuple(r.tile for r in settled.reports), tuple(r.tile for r in settled.reports if not r.converged),
     )  # fmt: skip
 
 
 def _stage_one(
-    blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected]
-) -> dict[str, NDArray[np.bool_]]:
-    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of control points."""
+    blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected], innovation: float
+) -> tuple[dict[str, NDArray[np.bool_]], dict[str, BlockTest]]:
+    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of control points.
+
+    Beside it the tests of blocks, also of rejected ones, that have points in common with the last version.
+    """
     of_images = [block for block in blocks if control_point_of(block.block_id) is None]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
-    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid) for group in groups]
+    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid, _gate(group, base)) for group in groups]
     handles = executor.submit_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
     accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if control_point_of(b.block_id) is not None}
+    tests: dict[str, BlockTest] = {}
     for outcome in (outcome for group in executor.results(handles) for outcome in group):
         reason = outcome.reason or disagreement(outcome.accepted)
+        if reason is None and outcome.test is not None:
+            tests[outcome.block_id] = outcome.test
+            if outcome.test.rejected(innovation):
+                reason = outcome.test.reason(innovation, base.version)
         if reason is None:
             accepted[outcome.block_id] = outcome.accepted
         else:
             refused.append(Rejected(outcome.block_id, reason))
-    return accepted
+    return accepted, tests
+
+
+def _gate(blocks: Sequence[Block], base: Snapshot) -> Gate | None:
+    """What some blocks are tested by; None for a network without images."""
+    if not base.image_count():
+        return None
+    ids = [np.unique(block.point_ids) for block in blocks]
+    cells = np.split(base.candidate_cells(np.concatenate(ids)), np.cumsum([len(of_block) for of_block in ids])[:-1])
+    if not any((of_block >= 0).any() for of_block in cells):
+        return None
+    shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
+    return Gate(shared, tuple(cells))
+
+
+def _tested(test: BlockTest | None, version: int) -> tuple[float, int, float, int, int]:
+    """The last columns of a block's line in the ledger."""
+    return UNTESTED if test is None else (test.d2, test.dof, test.probability, test.left_out, version)
 
 
 def disagreement(accepted: NDArray[np.bool_]) -> str | None:

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestration.batch import BatchResult, Rejected, fuse_batch
+from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from orchestration.tasks import FlaggedImage
 from submin.errors import InputError
+from submin.network.innovation import REJECTED
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, control_point_of
@@ -33,6 +34,7 @@ class RunResult:
     Attributes
     ----------
     version : of the network afterwards; fused, skipped : numbers of blocks; rejected, flagged : with reasons
+    doubtful : fused blocks that agree with the network as few good ones do
     control_fused : number of control points
     rays_used, rays_rejected : rays in the network afterwards; ray_rms_px : residual of the used ones, per coordinate
     """
@@ -42,6 +44,7 @@ class RunResult:
     skipped: int
     control_fused: int
     rejected: tuple[Rejected, ...]
+    doubtful: tuple[Doubtful, ...]
     flagged: tuple[FlaggedImage, ...]
     ray_rms_px: float
     rays_used: int
@@ -58,6 +61,18 @@ class RunResult:
             "blocks_skipped": self.skipped,
             "control_fused": self.control_fused,
             "blocks_rejected": [{"block_id": r.block_id, "reason": r.reason} for r in self.rejected],
+            "blocks_doubtful": [
+                {
+                    "block_id": d.block_id,
+                    "d2": d.test.d2,
+                    "dof": d.test.dof,
+                    "probability": d.test.probability,
+                    "points": d.test.points,
+                    "points_left_out": d.test.left_out,
+                    "against": f"v{d.against}",
+                }
+                for d in self.doubtful
+            ],
             "images_flagged": [{"image_id": f.image_id, "reason": f.reason} for f in self.flagged],
             "ray_rms_px": self.ray_rms_px,
             "rays_used": self.rays_used,
@@ -75,6 +90,7 @@ class Tally:
     version: int
     released: set[int]
     rejected: list[Rejected] = field(default_factory=list)
+    doubtful: list[Doubtful] = field(default_factory=list)
     flagged: dict[int, FlaggedImage] = field(default_factory=dict)
     unsettled: set[int] = field(default_factory=set)
     fused: int = 0
@@ -85,6 +101,7 @@ class Tally:
         """Count a batch."""
         self.version = batch.version
         self.rejected.extend(batch.rejected)
+        self.doubtful.extend(batch.doubtful)
         self.flagged.update({f.row: f for f in batch.flagged})
         self.unsettled = (self.unsettled - set(batch.tiles)) | set(batch.unsettled)
         control = sum(control_point_of(block_id) is not None for block_id in batch.fused)
@@ -93,9 +110,12 @@ class Tally:
 
 
 def run(
-    catalogue: Catalogue, place: str, executor: Executor, *, batch_blocks: int = DEFAULT_BATCH_BLOCKS, reporter: Reporter | None = None
-) -> RunResult:
+    catalogue: Catalogue, place: str, executor: Executor, *, batch_blocks: int = DEFAULT_BATCH_BLOCKS, reporter: Reporter | None = None,
+    innovation: float = REJECTED,
+) -> RunResult:  # fmt: skip
     """Fuse every block of a catalogue that the network does not have yet.
+
+    A block that contradicts the network as a whole, as one of fewer than ``innovation`` good blocks would, is rejected; 0 rejects none.
 
     Raises
     ------
@@ -114,13 +134,13 @@ def run(
     )
     check = catalogue.points("check")
     tally = fuse_blocks(
-        every, place, executor, batch_blocks, reporter, check_points=np.empty(0, dtype="U1") if check is None else check.point_ids
+        every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids
     )
     return _result(Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
 
 
 def fuse_blocks(
-    blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter,
+    blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter, innovation: float = REJECTED,
     check_points: NDArray[np.str_] | None = None,
 ) -> Tally:  # fmt: skip
     """Fuse those of some blocks that the network does not have yet, so many to a commit; it remembers ``check_points`` with them.
@@ -139,7 +159,7 @@ def fuse_blocks(
         while batch := list(islice(new, max(batch_blocks, 1))):
             good = [block for block, reason in batch if reason is None]
             refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, check_points))
+            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, innovation, check_points))
             reporter.fused(len(batch))
     return tally
 
@@ -151,7 +171,7 @@ def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -
     square = sum(cell["square_px"] for cell in cells)
     return RunResult(
         after.version, tally.fused, tally.skipped, tally.control,
-        tuple(tally.rejected), tuple(tally.flagged[row] for row in sorted(released)),
+        tuple(tally.rejected), tuple(tally.doubtful), tuple(tally.flagged[row] for row in sorted(released)),
         float(np.sqrt(square / (2.0 * in_pixels))) if in_pixels else 0.0, used, sum(cell["rays"] for cell in cells) - used,
         tuple(after.cover.tile_name(t) for t in sorted(tally.unsettled)), time.monotonic() - started, executor.peak_memory_mb(),
     )  # fmt: skip

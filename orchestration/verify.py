@@ -12,6 +12,7 @@ import numpy as np
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from submin.errors import StoreError, SubminError
+from submin.network.variance_factor import VarianceFactor, pooled
 from submin.storage.network_store import Snapshot
 from submin.storage.problems import DAMAGE, Problem, first_line
 from submin.storage.verify_tables import stored_tiles, verify_network
@@ -41,6 +42,11 @@ class Verified:
         """True for a sound network."""
         return not self.problems
 
+    @property
+    def variance_factors(self) -> tuple[VarianceFactor, ...]:
+        """Of all measurements, by sensor and platform."""
+        return pooled(tile.fits for tile in self.tiles if tile.fits is not None)
+
     def worst(self, name: str) -> float:
         """The largest of the numbers of the tiles, NaN without any."""
         return float(np.fmax.reduce([getattr(tile, name) for tile in self.tiles], initial=np.nan))
@@ -57,6 +63,10 @@ class Verified:
             "problems": [{"tile": p.tile, "kind": p.kind, "detail": p.detail} for p in self.problems],
             "tiles": tiles,
             **{f"{name}_max": _number(self.worst(name)) for name in NUMBERS},
+            "variance_factors": [
+                {"sensor": v.sensor, "platform": v.platform, "factor": v.factor, "redundancy": v.redundancy, "sigma": v.sigma}
+                for v in self.variance_factors
+            ],
             "seconds": self.seconds,
         }
 

@@ -9,6 +9,9 @@ import typer
 
 from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, counted, show
 
+LARGEST_INNOVATION = 1e-3
+"""Blocks less improbable than that are not even doubtful."""
+
 app = typer.Typer()
 control_app = typer.Typer(no_args_is_help=True, help="Surveyed control points.")
 app.add_typer(control_app, name="control")
@@ -71,6 +74,10 @@ def run(
     scheduler: Scheduler = None,
     batch_blocks: Annotated[int, typer.Option("--batch-blocks", help="Blocks that one commit holds.")] = 500,
     sequential: Annotated[bool, typer.Option("--sequential", help="Fuse block by block, in the order of the catalogue.")] = False,
+    innovation: Annotated[
+        float,
+        typer.Option("--innovation", help="Reject a block that contradicts the network as only this part of good ones does; 0: none."),
+    ] = 1e-6,
     as_json: Json = False,
 ) -> None:
     """Fuse every block of a catalogue that the network does not have yet. The same command again continues, or says that nothing is left.
@@ -85,9 +92,13 @@ def run(
 
     check_range("--workers", workers, 0, MOST_WORKERS)
     check_range("--batch-blocks", batch_blocks, 1)
+    if not 0.0 <= innovation <= LARGEST_INNOVATION:
+        from submin.errors import InputError
+
+        raise InputError(f"--innovation is {innovation:g}; expected 0 to {LARGEST_INNOVATION:g}")
     opened = Catalogue.open(catalogue)
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
-        result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
+        result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter, innovation=innovation)
     lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
     if result.rays_used:
         lines.append(
@@ -97,6 +108,11 @@ def run(
     if not result.fused and not result.rejected:
         lines[0] = f"{network} {result.version}: nothing is left to do, all {result.skipped} blocks are in the network"
     lines += [f"bad camera {f.image_id}: {f.reason}" for f in result.flagged]
+    lines += [
+        f"doubtful block {d.block_id}: d2 against v{d.against} is {d.test.d2:.1f} with {d.test.dof} degrees of freedom "
+        f"(probability {d.test.probability:.1e}); it was fused"
+        for d in result.doubtful
+    ]
     lines += [f"rejected block {r.block_id}: {r.reason}" for r in result.rejected]
     lines += [f"tile {t}: the judgement of its rays did not settle; they are used as last judged" for t in result.unsettled_tiles]
     show(result.to_json(), as_json, "\n".join(lines))

@@ -14,7 +14,9 @@ from submin.storage.catalogue_schema import Block, defects
 from submin.storage.control_blocks import control_point_of
 from submin.storage.network_store import Snapshot
 
-_MEASURED = re.compile(r"\d+\.\d+")
+UNTESTED = (0.0, 0, 1.0, 0, -1)
+"""The last columns of a line of a block that was not tested: nothing of it was in the network."""
+_MEASURED = re.compile(r"\d+\.\d+|\bv\d+\b")
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,8 @@ class Entry:
     reason : why it was rejected, or which images are withdrawn from it
     version : that the line came with
     images, rays, rays_rejected : what the network has of the block
+    d2, dof, probability, left_out, against : test by the network when the block came (`submin.network.innovation.BlockTest`): statistic,
+        degrees of freedom, probability, common points left out, and number of the version; `UNTESTED` where nothing was in common
     """
 
     block_id: str
@@ -39,6 +43,11 @@ class Entry:
     images: int = 0
     rays: int = 0
     rays_rejected: int = 0
+    d2: float = 0.0
+    dof: int = 0
+    probability: float = 1.0
+    left_out: int = 0
+    against: int = -1
 
 
 def append_entries(ledger: zarr.Group, entries: Sequence[Entry]) -> None:
@@ -106,7 +115,7 @@ class Ledger:
         self.block_of_image.update((image.image_id, block.block_id) for image in block.images)
 
     def said(self, block_id: str, reason: str) -> bool:
-        """True when the last line of a block is a rejection for the same reason; a measured value in it may be another by now."""
+        """True when the last line of a block is a rejection for the same reason; measured values and versions in it may be others."""
         return _MEASURED.sub("", self.rejections.get(block_id, "")) == _MEASURED.sub("", reason)
 
     def fused(self) -> tuple[Entry, ...]:

@@ -64,10 +64,21 @@ class Network:
 
     def __init__(self, place: str, version: str | None = None, parameters: int = 0) -> None:
         """``parameters``: least number of adjustable parameters to keep for each image, for images that are to be joined to it."""
-        self._snapshot = Snapshot.open(place, version, parameters)
+        self._begin(Snapshot.open(place, version, parameters))
+
+    @classmethod
+    def over(cls, snapshot: Snapshot) -> Network:
+        """The network of a version that is open already."""
+        network = cls.__new__(cls)
+        network._begin(snapshot)
+        return network
+
+    def _begin(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
         self._cells: OrderedDict[int, Cell] = OrderedDict()
         self._images: dict[int, NetworkImage] = {}
         self._numbers: tuple[int, ...] | None = None
+        self._tiles: frozenset[int] | None = None
 
     @property
     def version(self) -> str:
@@ -360,7 +371,9 @@ class Network:
 
     def sub_min(self, tile: int, images: Index | None) -> SubMin:
         """A tile's sub-MIN, or its marginal on some images."""
-        if tile not in self._snapshot.tile_numbers():
+        if self._tiles is None:
+            self._tiles = frozenset(self._snapshot.tile_numbers())
+        if tile not in self._tiles:
             raise QueryError(f"tile {self.cover.tile_name(tile)} holds nothing yet; see 'submin info'")
         return self._snapshot.sub_min(tile, images)
 

@@ -21,7 +21,7 @@ from submin.network.sub_min import SubMin, wider
 from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 COVARIANCE_CHUNK = 256
 
 IMAGE_COLUMNS = {
@@ -32,6 +32,7 @@ IMAGE_COLUMNS = {
 LEDGER_COLUMNS = {
     "block_id": "text", "content": "text", "status": "text", "reason": "text", "version": "int64",
     "images": "int64", "rays": "int64", "rays_rejected": "int64",
+    "d2": "float64", "dof": "int64", "probability": "float64", "left_out": "int64", "against": "int64",
 }  # fmt: skip
 FLAG_COLUMNS = {"tile": "int64", "image": "int64"}
 """Which tile finds the camera of which image bad; the prior of an image is released while any tile says so."""

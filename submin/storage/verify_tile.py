@@ -20,6 +20,7 @@ from submin.network.health import asymmetry, condition, positive_semi_definite, 
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.replay import joined, replay_error
 from submin.network.sub_min import SubMin, add_sums, factor, wider
+from submin.network.variance_factor import Fits, Kind, fits
 from submin.query.planner import DETERMINED_METRES
 from submin.storage.arrays import array_of, attributes_of, group_of, hash_ids, read_record
 from submin.storage.network_store import Snapshot
@@ -71,6 +72,7 @@ class TileHealth:
     images, parameters : that it sees; 0 without a sub-MIN
     condition : of its information, scaled to a unit diagonal
     sums_error, factor_error, symmetric_error, replay_error : see docs/quality.md; NaN where there was nothing to compare
+    fits : of the measurements of the points in its own core, by sensor and platform
     """
 
     tile: str
@@ -84,6 +86,7 @@ class TileHealth:
     factor_error: float = float("nan")
     symmetric_error: float = float("nan")
     replay_error: float = float("nan")
+    fits: Fits | None = None
 
 
 @dataclass
@@ -164,6 +167,11 @@ class _Images:
         read, metadata = self._read, self._snapshot.metadata
         return image_set([read[k] for k in np.searchsorted(self._rows, rows).tolist()], metadata.ellipsoid, metadata.parameters)
 
+    def kinds(self, rows: NDArray[np.int32]) -> list[Kind]:
+        """Sensor and platform of the images of some rows."""
+        table = self._snapshot.image_columns(["sensor", "platform"])
+        return list(zip(table["sensor"][rows].tolist(), table["platform"][rows].tolist(), strict=True))
+
 
 def _contents(cell: Cell) -> CellContents:
     rays = np.bincount(cell.rays.image, minlength=len(cell.images))
@@ -196,7 +204,7 @@ def _read_cell(snapshot: Snapshot, number: int, name: str, found: _Findings) -> 
     return cell
 
 
-def _damage(cell: Cell, number: int, image_count: int) -> list[tuple[str, str]]:
+def _damage(cell: Cell, number: int, image_count: int) -> list[Kind]:
     """What keeps a cell from being computed with: kind and detail."""
     n, m, rays, sums = len(cell.point_ids), len(cell.images), cell.rays, cell.sums
     r, size = len(rays.point), m * cell.theta.shape[1] if cell.theta.ndim == 2 else -1
@@ -357,20 +365,27 @@ def _compare(images_of: _Images, stored: SubMin, linear: Sequence[_Linear], foun
             f"the sub-MIN differs from the factorisation of its cells by {numbers['factor_error']:.1e} standard deviations; "
             f"expected at most {allowed:.0e}: a cell, or the a priori model of an image, is not what it was factored from",
         )
-    numbers["replay_error"], allowed = _replayed(stored, linear, images, root, tile), max(REPLAY_TOLERANCE, ROUND_OFF * number)
+    every, weight = _together(stored, linear), np.concatenate([of_cell.weight for of_cell in linear])
+    numbers["replay_error"], allowed = _replayed(stored, every, weight, images, root, tile), max(REPLAY_TOLERANCE, ROUND_OFF * number)
     if not stale and not numbers["replay_error"] <= allowed:
         found.add("round-off", f"the sub-MIN differs from its replay by {numbers['replay_error']:.1e}; expected at most {allowed:.0e}")
+    own = np.concatenate([np.full(len(of_cell.weight), Cover.owner(of_cell.cell.number) == tile) for of_cell in linear])
+    numbers["fits"] = fits(every, weight * own, stored.theta, stored.covariance, images_of.kinds(rows))
     return numbers
 
 
-def _replayed(stored: SubMin, linear: Sequence[_Linear], images: ImageSet, root: Array, tile: int) -> float:
-    """See `submin.network.replay.replay_error`; the combinations of points are the same in every call."""
+def _together(stored: SubMin, linear: Sequence[_Linear]) -> LinearRays:
+    """The rays of all cells that a tile holds; ``image`` are rows of its sub-MIN."""
     parts = []
     for of_cell in linear:
         rays = of_cell.rays
         at = np.searchsorted(stored.images, of_cell.cell.images)[rays.image].astype(np.int32)
         parts.append(LinearRays(rays.first, at, rays.by_ground, rays.by_parameters, rays.y))
-    every, weight = joined(parts), np.concatenate([of_cell.weight for of_cell in linear])
+    return joined(parts)
+
+
+def _replayed(stored: SubMin, every: LinearRays, weight: Array, images: ImageSet, root: Array, tile: int) -> float:
+    """See `submin.network.replay.replay_error`; the combinations of points are the same in every call."""
     factors = point_factors(every, weight)
     spread = np.trace(factors.own, axis1=1, axis2=2)
     good = np.flatnonzero((factors.rank == 3) & (np.where(factors.rank == 3, spread, np.inf) < DETERMINED_METRES**2))
