@@ -47,7 +47,8 @@ def query(
     if max_points is not None:
         check_range("--max-points", max_points, 1)
     started = time.monotonic()
-    control = submin.open(network, at).query(
+    opened = submin.open(network, at)
+    control = opened.query(
         bbox=bbox, area=None if aoi is None else read_area(aoi), points=None if points is None else read_point_ids(points),
         tile=tile, policy=policy, max_points=max_points,
     )  # fmt: skip
@@ -58,6 +59,8 @@ def query(
         "points": len(control), "policy": control.policy, "tiles": list(control.tiles), "version": control.version, "scope": control.scope,
         "blocks": len(control.blocks), "seconds": seconds, "out": None if output is None else str(output),
     }  # fmt: skip
+    if opened.dense is not None:
+        values |= {"chi_square": opened.dense.points.chi_square, "degrees_of_freedom": opened.dense.points.redundancy}
     if not len(control):
         show(values, as_json, f"{network} {control.version}: no determined points there")
         return
@@ -131,8 +134,11 @@ def map_command(
     """
     import submin
     from orchestration.network_map import draw_network
+    from submin.storage.dense_reader import refuse_dense
 
-    draw_network(submin.open(network), output)
+    opened = submin.open(network)
+    refuse_dense(opened.snapshot, "a map")
+    draw_network(opened, output)
     show({"out": str(output)}, as_json, f"map written to {output}")
 
 

@@ -46,6 +46,10 @@ def accuracy_map(network: Network) -> PointAccuracy:
 
     Points whose rays determine no position are left out. Memory is that of one tile's sub-MIN and of its own points.
     """
+    if network.dense is not None:
+        dense, tile = network.dense, network.cover.tile_name(0)
+        ids = dense.points.ids
+        return PointAccuracy(ids, dense.geodetic, dense.ce90(), dense.le90(), np.full(len(ids), tile), dense.observation_counts)
     return _joined([_of_tile(network, tile) for tile in network.snapshot.tile_numbers()])
 
 

@@ -21,6 +21,7 @@ from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import cross_covariance
 from submin.query.planner import Answer, answer, determined_parts, points_in_area, points_named, points_of_tile, well_spread
 from submin.storage.arrays import group_of, read_record
+from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
 from submin.tiling.cover import Cover
@@ -44,6 +45,7 @@ class Network:
         self._cells: OrderedDict[int, Cell] = OrderedDict()
         self._images: dict[int, NetworkImage] = {}
         self._numbers: tuple[int, ...] | None = None
+        self._dense = DenseReader(self._snapshot) if is_dense(self._snapshot) else None
 
     @property
     def version(self) -> str:
@@ -54,6 +56,11 @@ class Network:
     def snapshot(self) -> Snapshot:
         """The version in the store."""
         return self._snapshot
+
+    @property
+    def dense(self) -> DenseReader | None:
+        """What only a dense network has; None for a factored one."""
+        return self._dense
 
     def at(self, version: str) -> Network:
         """The same network at another version.
@@ -97,6 +104,8 @@ class Network:
         number = None if tile is None else self.cover.tile_number(tile)
         if bbox is not None:
             area = box_area(bbox)
+        if self._dense is not None:
+            return self._query_dense(self._dense, area, points, policy, max_points)
         if area is not None:
             selections = points_in_area(self, area)
             if not selections and _inside_when_swapped(area, self.cover):
@@ -121,9 +130,26 @@ class Network:
             selections = well_spread(selections, max_points)
         return self._control_set(answer(self, selections, policy, number))
 
+    def _query_dense(
+        self, dense: DenseReader, area: BaseGeometry | None, points: Sequence[str] | NDArray[np.str_] | None, policy: str, most: int | None
+    ) -> ControlSet:
+        """Answer of a dense network; its one tile holds every point."""
+        if area is not None:
+            rows = dense.in_area(area)
+            if not len(rows) and _inside_when_swapped(area, self.cover):
+                raise QueryError(
+                    "the area queried is outside the network, and inside it with its axes swapped; expected longitude first, then latitude"
+                )
+        else:
+            rows = np.arange(len(dense.points.ids)) if points is None else dense.named(points)
+        return dense.answer(rows, policy, most)
+
     def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
         """Those of some points that the network can answer for, by their cell."""
         ids = np.unique(np.asarray(points, dtype=np.str_))
+        if self._dense is not None:
+            held = self._dense.held(ids)
+            return {0: held} if len(held) else {}
         selections, _ = points_named(self, ids, self._snapshot.candidate_cells(ids))
         return {s.cell.number: s.cell.point_ids[s.rows] for s in selections}
 
@@ -146,6 +172,7 @@ class Network:
         QueryError
             When a tile does not hold a point, or a point is not determined.
         """
+        refuse_dense(self._snapshot, "a covariance between tiles")
         tiles = self.cover.tile_number(one), self.cover.tile_number(other)
         found = [self._parts_of_tile(tile, np.asarray(ids, dtype=np.str_)) for tile, ids in zip(tiles, (ids_one, ids_other), strict=True)]
         (names, parts, places), (names_other, parts_other, places_other) = found
