@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import chain, islice
 from typing import Any
 
@@ -35,7 +35,20 @@ from submin.storage.writer_lock import writing
 FAR_METRES = 1000.0
 """Observations that are off by more from where the network has their points are of other points of the same name."""
 
+DOUBTFUL = 0.001
+"""A good block agrees with what was there as badly as a doubtful one in one case of a thousand (decision 012)."""
+
 Arrival = Block | Member
+
+
+@dataclass(frozen=True)
+class Doubtful:
+    """Blocks that were fused (together, mostly one) and hardly agree with what was there; which of the two is wrong is not told."""
+
+    block_ids: tuple[str, ...]
+    d2: float
+    degrees_of_freedom: int
+    probability: float
 
 
 @dataclass(frozen=True)
@@ -47,6 +60,7 @@ class DenseRunResult:
     version : of the network afterwards; fused, skipped : numbers of blocks and clusters; control_fused : of sets of control
     pending : blocks of the network that wait for a point of theirs to be determined
     observations : positions and baselines that came
+    doubtful : blocks that hardly agree with what was there when they came
     chi_square, degrees_of_freedom : of the whole network
     """
 
@@ -56,6 +70,7 @@ class DenseRunResult:
     control_fused: int
     rejected: tuple[Rejected, ...]
     pending: tuple[str, ...]
+    doubtful: tuple[Doubtful, ...]
     points: int
     observations: int
     chi_square: float
@@ -69,7 +84,8 @@ class DenseRunResult:
             "version": self.version, "blocks_fused": self.fused, "blocks_skipped": self.skipped, "blocks_pending": list(self.pending),
             "control_fused": self.control_fused,
             "blocks_rejected": [{"block_id": r.block_id, "reason": r.reason} for r in self.rejected],
-            "images_flagged": [], "points": self.points, "observations": self.observations,
+            "blocks_doubtful": [asdict(d) for d in self.doubtful], "images_flagged": [],
+            "points": self.points, "observations": self.observations,
             "chi_square": self.chi_square, "degrees_of_freedom": self.degrees_of_freedom,
             "seconds": self.seconds, "peak_memory_mb": self.peak_memory_mb,
         }  # fmt: skip
@@ -86,6 +102,7 @@ class DenseTally:
     control_skipped: int = 0
     observations: int = 0
     rejected: list[Rejected] = field(default_factory=list)
+    doubtful: list[Doubtful] = field(default_factory=list)
 
 
 class Working:
@@ -190,7 +207,8 @@ def run_dense(
     there = {entry.block_id for entry in Ledger.of(after).entries.values() if entry.status == "fused"}
     return DenseRunResult(
         after.version, tally.fused, tally.skipped, tally.control, tuple(tally.rejected), tuple(sorted(there - set(points.blocks))),
-        len(points.ids), tally.observations, points.chi_square, points.redundancy, time.monotonic() - started, own_peak_memory_mb(),
+        tuple(tally.doubtful), len(points.ids), tally.observations,
+        points.chi_square, points.redundancy, time.monotonic() - started, own_peak_memory_mb(),
     )  # fmt: skip
 
 
@@ -297,7 +315,10 @@ def _fuse_batch(place: str, work: Working, group: Sequence[tuple[Arrival, Member
     unsaid = [r for r in refused if not work.ledger.said(r.block_id, r.reason)]
     if not members and not unsaid:
         return  # the same command again writes nothing
-    work.network.add(member.cluster for _, member in members)
+    for done in work.network.add(member.cluster for _, member in members):
+        test = done.innovation
+        if test.probability < DOUBTFUL:
+            tally.doubtful.append(Doubtful(done.block_ids, test.d2, test.degrees_of_freedom, test.probability))
     session, base = begin_change(place, tally.version)
     root, version = zarr.open_group(session.store, mode="r+"), base.number + 1
     append_members(root, [member for _, member in members], version)

@@ -128,6 +128,8 @@ def _run_dense(catalogue: Catalogue, network: str, batch_blocks: int, as_json: b
     if done.pending:
         few = ", ".join(done.pending[:5]) + ", ..." * (len(done.pending) > 5)
         lines.append(f"{counted(len(done.pending), 'block')} waiting for points that are not determined yet: {few}")
+    lines += [f"doubtful: {', '.join(d.block_ids)}: d2 {d.d2:.1f} with {d.degrees_of_freedom} degrees of freedom (probability "
+              f"{d.probability:.2g}) against what was there; it was fused" for d in done.doubtful]  # fmt: skip
     lines += [f"rejected block {r.block_id}: {r.reason}" for r in done.rejected]
     show(done.to_json(), as_json, "\n".join(lines))
     if done.rejected:

@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from networks import area_of, by_image, rewrite
 from numpy.typing import NDArray
 
 import submin
+from orchestration import dense_run
 from orchestration.adjust import adjust
 from orchestration.check import check
 from orchestration.create import create, fit_points
@@ -33,7 +35,7 @@ from submin.storage.catalogue_schema import CatalogueMetadata, PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
 from submin.storage.dense_store import read_state
 from submin.storage.network import Network
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.network_store import Snapshot, commit, versions
 from submin.storage.writer_lock import writing
 
 Array = NDArray[np.float64]
@@ -257,6 +259,43 @@ def test_what_cannot_come_in_is_told_and_the_rest_comes(survey: tuple[dict[str, 
     with pytest.raises(InputError, match="frame is 'ITRF2020'"):
         run_dense(Catalogue.open(other), str(place))
     assert [v.name for v in versions(str(place))] == ["v1", "v0"]
+
+
+def test_a_block_that_hardly_agrees_is_told(survey: tuple[dict[str, Array], list[Cluster]], base: Path, tmp_path: Path) -> None:
+    at, clusters = survey
+    good = position_cluster(np.random.default_rng(3), at, "good", ["p007", "p008"])
+    wrong = dataclasses.replace(good, cluster_id="wrong", values=good.values + np.array([0.2, 0.0, 0.0]))
+    done = run_dense(catalogue_of([good, wrong], tmp_path / "more"), str(base))
+    assert [d.block_ids for d in done.doubtful] == [("wrong",)]
+    assert done.doubtful[0].degrees_of_freedom == 6
+    assert done.to_json()["blocks_doubtful"][0]["probability"] < 1e-6
+    assert len(submin.open(base).query(tile="r000c000").blocks) == len(clusters) + 2
+
+
+def test_a_change_that_is_not_committed_is_not_there(
+    survey: tuple[dict[str, Array], list[Cluster]], fused: tuple[Path, DenseRunResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    """A run that ends between two commits: the same command again completes it."""
+    _, clusters = survey
+    catalogue = catalogue_of(clusters, tmp_path / "catalogue")
+    place = tmp_path / "network"
+    create(str(place), fit_points(catalogue), catalogue.metadata, None, None, "dense")
+    commits = []
+
+    def second_fails(*arguments: Any) -> None:
+        commits.append(arguments)
+        if len(commits) == 2:
+            raise KeyboardInterrupt
+        commit(*arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(dense_run, "commit", second_fails)
+        with pytest.raises(KeyboardInterrupt):
+            run_dense(catalogue, str(place), batch_blocks=30)
+    assert versions(str(place))[0].name == "v1"
+    rest = run_dense(catalogue, str(place), batch_blocks=30)
+    assert (rest.skipped, rest.fused) == (30, len(clusters) - 30)
+    same(place, fused[0])
 
 
 # -- blocks of images
