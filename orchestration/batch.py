@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
 from orchestration.change import Move, finish, place, settle, take_points
@@ -14,9 +14,10 @@ from orchestration.executors import Executor
 from orchestration.progress import Reporter
 from orchestration.tasks import BlockRays, FlaggedImage, adjust_blocks
 from submin.geodesy import geocentric_to_geodetic
-from submin.network.network_image import NetworkImage
 from submin.network.registration import LooseRays, together
+from submin.storage.block_images import network_images as network_images
 from submin.storage.catalogue_schema import Block
+from submin.storage.check_points import enter_check_points
 from submin.storage.control_blocks import control_point_of
 from submin.storage.ledger import Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
@@ -55,9 +56,12 @@ class BatchResult:
 
 
 def fuse_batch(
-    where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter
-) -> BatchResult:
+    where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter,
+    check_points: NDArray[np.str_] | None = None,
+) -> BatchResult:  # fmt: skip
     """Fuse blocks that the ledger of a version has let through; ``rejected`` ones are entered in the ledger in the same commit.
+
+    So are the ids of ``check_points``, where blocks are fused.
 
     Raises
     ------
@@ -82,6 +86,8 @@ def fuse_batch(
         for b, n in zip(blocks, rejected_rays, strict=True)
     ]  # fmt: skip
     entries += [Entry(r.block_id, "", "rejected", r.reason, version) for r in unsaid]
+    if blocks and check_points is not None:
+        enter_check_points(zarr.open_group(session.store, mode="r+"), base, check_points)
     records = [image for block in blocks for image in block.images]
     finish(session, base, move, settled, records, entries, f"{len(blocks)} blocks fused, {len(refused)} rejected")
     return BatchResult(
@@ -163,14 +169,6 @@ def _inside_when_swapped(ids: NDArray[np.str_], move: Move) -> bool:
     possible = np.abs(geodetic[:, 0]) <= 90.0
     inside = possible & ~move.cover.outside(geodetic[:, 1], np.where(possible, geodetic[:, 0], 0.0))
     return 2 * int(inside.sum()) > len(inside)
-
-
-def network_images(block: Block) -> tuple[NetworkImage, ...]:
-    """The images of a block of a catalogue as a network has them."""
-    a_priori = "" if block.a_priori is None else json.dumps(block.a_priori.to_mapping(), sort_keys=True)
-    return tuple(
-        NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, a_priori) for i in block.images
-    )
 
 
 def block_rays(block: Block) -> BlockRays:

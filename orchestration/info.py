@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from submin import Network
-from submin.storage.accuracy_map import accuracy_map
+from submin.storage.accuracy_map import accuracy_of_all
 from submin.storage.dense_reader import DenseReader
 from submin.storage.ledger import Ledger
 
@@ -22,10 +22,14 @@ def describe(network: Network) -> dict[str, Any]:
     images = snapshot.image_columns(["image_id", "sensor", "released", "withdrawn"])
     here = (images["withdrawn"] == 0) & (images["sensor"] != "survey")
     ledger = Ledger.of(snapshot)
-    accuracy = accuracy_map(network)
+    accuracy = accuracy_of_all(network)
+    reported = ~accuracy.thinned & ~accuracy.retired
     return {
         "version": network.version,
         "points": len(accuracy.ids),
+        "points_reported": int(reported.sum()),
+        "points_thinned": int(accuracy.thinned.sum()),
+        "points_retired": int(accuracy.retired.sum()),
         "points_pending": int(sum(c["points"] for c in cells)) - len(accuracy.ids),
         "rays": int(sum(c["rays"] for c in cells)),
         "rays_rejected": int(sum(c["rays"] - c["accepted"] for c in cells)),
@@ -34,11 +38,13 @@ def describe(network: Network) -> dict[str, Any]:
         "blocks": len(ledger.fused()),
         "control_points": len(ledger.control_points()),
         "tiles": len(snapshot.tile_numbers()),
+        "tiles_of_the_area": network.cover.tile_count,
         "cells": len(cells),
-        "ce90_median": float(np.median(accuracy.ce90)) if len(accuracy.ids) else float("nan"),
-        "le90_median": float(np.median(accuracy.le90)) if len(accuracy.ids) else float("nan"),
+        "ce90_median": float(np.median(accuracy.ce90[reported])) if reported.any() else float("nan"),
+        "le90_median": float(np.median(accuracy.le90[reported])) if reported.any() else float("nan"),
         "tile_km": network.cover.core / 1000.0,
         "overlap_km": network.cover.overlap / 1000.0,
+        "thin_metres": snapshot.metadata.thinning,
         "frame": snapshot.metadata.frame,
         "bytes": _size(snapshot.place),
     }

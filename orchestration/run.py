@@ -9,6 +9,7 @@ from itertools import chain, islice
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orchestration.batch import BatchResult, Rejected, fuse_batch
 from orchestration.executors import Executor
@@ -111,12 +112,18 @@ def run(
     every = chain(
         catalogue.blocks(), () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
     )
-    tally = fuse_blocks(every, place, executor, batch_blocks, reporter)
+    check = catalogue.points("check")
+    tally = fuse_blocks(
+        every, place, executor, batch_blocks, reporter, check_points=np.empty(0, dtype="U1") if check is None else check.point_ids
+    )
     return _result(Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
 
 
-def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> Tally:
-    """Fuse those of some blocks that the network does not have yet, so many to a commit.
+def fuse_blocks(
+    blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter,
+    check_points: NDArray[np.str_] | None = None,
+) -> Tally:  # fmt: skip
+    """Fuse those of some blocks that the network does not have yet, so many to a commit; it remembers ``check_points`` with them.
 
     Raises
     ------
@@ -132,7 +139,7 @@ def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_b
         while batch := list(islice(new, max(batch_blocks, 1))):
             good = [block for block, reason in batch if reason is None]
             refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
-            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter))
+            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, check_points))
             reporter.fused(len(batch))
     return tally
 

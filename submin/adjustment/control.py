@@ -30,7 +30,8 @@ from scipy.stats import chi2, norm
 
 from submin.adjustment.blunders import CRITICAL_RAY, TESTABLE
 from submin.adjustment.elimination import LinearRays, eliminate, point_factors
-from submin.adjustment.estimation import cholesky, fill_symmetric
+from submin.adjustment.estimation import cholesky
+from submin.adjustment.symmetric import fill_symmetric
 from submin.errors import NumericalError
 
 Array = NDArray[np.float64]

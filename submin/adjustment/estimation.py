@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import Sums
+from submin.adjustment.symmetric import between, fill_symmetric
 from submin.errors import NumericalError
 
 Array = NDArray[np.float64]
@@ -44,40 +45,30 @@ class ImageEstimate:
         NumericalError
             When the factor is not that of a regular matrix.
         """
-        if not len(self.factor):
-            return np.zeros((self.prior.shape[0], self.prior.shape[0]))
-        inverse, info = la.lapack.dpotri(self.factor, lower=1)
-        if info != 0:
-            raise NumericalError(f"the information matrix ({len(self.factor)} parameters) cannot be inverted")
-        return np.asarray(self.prior @ (self.prior @ fill_symmetric(np.asarray(inverse))).T)
+        return covariance_of(self.factor.copy(order="F"), self.prior)
 
 
-DENSE_SIZE = 200
-"""Up to so many parameters a dense product with the a priori factor costs less than looking up its few entries."""
-MIRROR_BLOCK = 256
+def covariance_of(factor: Array, prior: sp.csr_array) -> Array:
+    """``M = K (L L')^-1 K'`` (m p, m p), both triangles, of the Cholesky factor L (Fortran order) of the information and a priori factor K.
 
+    L is overwritten by the inverse: at most two matrices of this size exist at a time.
 
-def fill_symmetric(lower: Array) -> Array:
-    """The full symmetric matrix of a lower triangle, in place, block by block (a whole transpose would miss the cache)."""
-    size = len(lower)
-    for start in range(0, size, MIRROR_BLOCK):
-        stop = min(start + MIRROR_BLOCK, size)
-        square = lower[start:stop, start:stop]
-        square[...] = np.tril(square) + np.tril(square, -1).T  # what LAPACK left above the diagonal must not take part
-        lower[start:stop, stop:] = lower[stop:, start:stop].T
-    return lower
+    Raises
+    ------
+    NumericalError
+        When the factor is not that of a regular matrix.
+    """
+    if not len(factor):
+        return np.zeros((prior.shape[0], prior.shape[0]))
+    inverse, info = la.lapack.dpotri(factor, lower=1, overwrite_c=1)
+    if info != 0:
+        raise NumericalError(f"the information matrix ({len(factor)} parameters) cannot be inverted")
+    return between(prior, fill_symmetric(np.asarray(inverse)).T)  # the transpose is in C order, and the same
 
 
 def reduced_information(information: Array, prior: sp.csr_array) -> Array:
-    """``I + K' S K`` (q, q), for summed information S (lower triangle) and a priori factor K."""
-    full = fill_symmetric(information.copy())
-    if len(full) <= DENSE_SIZE:
-        dense = prior.toarray()
-        total = dense.T @ (full @ dense)
-        total[np.diag_indices(len(total))] += 1.0
-        return np.asarray(total)
-    half = prior.T @ full
-    total = np.asarray((prior.T @ np.ascontiguousarray(half.T)).T)
+    """``I + K' S K`` (q, q), both triangles, for summed information S (lower triangle) and a priori factor K."""
+    total = between(prior, fill_symmetric(information.copy()), transposed=True)
     total[np.diag_indices(len(total))] += 1.0
     return total
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
 from submin.adjustment.rays import sorted_rays
+from submin.adjustment.symmetric import DENSE_SIZE, add_into, between, fill_symmetric, permuted
 from submin.sensors import sensor_named
 
 
@@ -31,3 +33,7 @@ def compile_kernels() -> None:
     image = np.array([0, 1, 0, 1], dtype=np.int32)
     rays = sorted_rays(index, image, observed, np.full((4, 2), 0.5), np.ones(4, dtype=np.bool_))
     adjust(images, rays, intersect(images, rays, 2))
+    # the sums of a tile are large and sparse, which those of two images are not
+    many = DENSE_SIZE + 1
+    add_into(np.zeros((many, many)), permuted(np.eye(many), np.arange(many), 1), np.arange(many), 1)
+    between(sp.eye_array(many, format="csr"), fill_symmetric(np.eye(many, order="F")).T)

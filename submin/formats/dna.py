@@ -114,9 +114,10 @@ class _Reader:
 
     def _entry(self, line: str, kind: str, later: int, first: int) -> Entry:
         start, end = line[2:22].strip(), "" if kind == "Y" else line[22:42].strip()
-        for name, station in (("first station", start), ("second station", end or kind)):
+        named = (("first", start, "3-22"), ("second", end, "23-42"))
+        for name, station, columns in named[:1] if kind == "Y" else named:
             if not station:
-                raise InputError(f"the {name} is missing; expected its name in columns {'3-22' if name[0] == 'f' else '23-42'}")
+                raise InputError(f"the {name} station is missing; expected its name in columns {columns}")
         if start == end:
             raise InputError(f"a baseline goes from {start!r} to itself; expected two stations")
         value, lower = np.zeros(3), list[float]()

@@ -268,10 +268,10 @@ def _elements(line: str, n: int) -> tuple[int, NDArray[np.int64], list[float], i
 
 def _places(estimate: Sequence[Parameter], a_priori: Sequence[Parameter]) -> NDArray[np.int64]:
     """Index of each a priori parameter among the estimated ones."""
-    index: Mapping[tuple[str, ...], int] = {parameter.key: i for i, parameter in enumerate(estimate)}
-    if len(index) != len(estimate):
-        twice = next(p for i, p in enumerate(estimate) if index[p.key] != i)
-        raise InputError(f"line {twice.line}: {' '.join(twice.key)} is estimated twice; expected it once")
+    index: dict[tuple[str, ...], int] = {}
+    for i, parameter in enumerate(estimate):
+        if index.setdefault(parameter.key, i) != i:
+            raise InputError(f"line {parameter.line}: {' '.join(parameter.key)} is estimated twice; expected it once")
     for parameter in a_priori:
         if parameter.key not in index:
             raise InputError(f"line {parameter.line}: a priori {' '.join(parameter.key)} is unknown; expected an estimated parameter")

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import LinearRays, PointFactors, Sums, eliminate, linearise, point_factors
-from submin.adjustment.estimation import fill_symmetric
 from submin.adjustment.images import ImageSet
 from submin.adjustment.rays import Rays, sorted_rays
+from submin.adjustment.symmetric import permuted
+from submin.errors import InputError
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -112,12 +113,29 @@ def empty_cell(number: int, parameters: int) -> Cell:
 
 
 def with_points(cell: Cell, new: RegisteredPoints) -> Cell:
-    """The cell with more points, none of which it holds yet. Its sums are *not* those of its rays until `summed` is called."""
+    """The cell with more points, none of which it holds yet. Its sums are *not* those of its rays until `summed` is called.
+
+    Raises
+    ------
+    InputError
+        When it holds one of the points: its rays would count twice.
+    """
+    twice = np.intersect1d(cell.point_ids, new.point_ids)
+    if len(twice):
+        raise InputError(
+            f"cell {cell.number}: holds {len(twice)} of the points already, {twice[0]} among them, and their rays would count twice; "
+            "expected points that it does not hold: take them out first, and put them back with all of their rays"
+        )
+    return with_rays(cell, new)
+
+
+def with_rays(cell: Cell, new: RegisteredPoints) -> Cell:
+    """The cell with more points and rays. Points that it holds stay where they are registered and linearised. Sums as in `with_points`."""
     ids = np.union1d(cell.point_ids, new.point_ids)
     old_rows, new_rows = np.searchsorted(ids, cell.point_ids), np.searchsorted(ids, new.point_ids)
     origin, linearised_at = np.empty((len(ids), 3)), np.empty((len(ids), 3))
-    origin[old_rows], linearised_at[old_rows] = cell.origin, cell.linearised_at
     origin[new_rows] = linearised_at[new_rows] = new.origin
+    origin[old_rows], linearised_at[old_rows] = cell.origin, cell.linearised_at
 
     images = np.union1d(cell.images, new.image).astype(np.int32)
     theta = np.zeros((len(images), cell.theta.shape[1]))
@@ -171,11 +189,10 @@ def summed(cell: Cell, images: ImageSet) -> Cell:
 
 def reordered(sums: Sums, order: Index | NDArray[np.int64], parameters: int) -> Sums:
     """Sums about the same images in another order: image k of the result is image ``order[k]``."""
-    rows = (np.asarray(order, dtype=np.int64)[:, None] * parameters + np.arange(parameters)).ravel()
-    if np.array_equal(rows, np.arange(len(rows))):
+    if np.array_equal(order, np.arange(len(order))):
         return sums
-    full = fill_symmetric(sums.information.copy())
-    return Sums(np.tril(full[np.ix_(rows, rows)]), sums.vector[rows], sums.misclosure, sums.redundancy)
+    rows = (np.asarray(order, dtype=np.int64)[:, None] * parameters + np.arange(parameters)).ravel()
+    return Sums(permuted(sums.information, order, parameters), sums.vector[rows], sums.misclosure, sums.redundancy)
 
 
 def factors(cell: Cell, images: ImageSet, points: NDArray[np.int64]) -> tuple[LinearRays, PointFactors]:

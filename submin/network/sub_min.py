@@ -11,18 +11,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import LinearRays, PointFactors, Sums, ground_corrections
-from submin.adjustment.estimation import estimate_images, fill_symmetric
+from submin.adjustment.estimation import covariance_of, estimate_images
 from submin.adjustment.images import ImageSet
+from submin.adjustment.symmetric import add_into, fill_symmetric
 from submin.network.cell import empty_sums, kept_rows, reordered
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
+Rows = NDArray[np.int64]
 
 DENSE_COLUMNS = 600
 """Up to so many image parameters a dense product beats a sparse one (a point sees few images, but BLAS is ten times faster a number)."""
@@ -87,8 +90,7 @@ def add_sums(parts: Sequence[tuple[Index, Sums]], images: Index, parameters: int
         weight = 1.0 if weights is None else weights[k]
         at = np.searchsorted(images, of_cell)
         rows = (at[:, None] * parameters + np.arange(parameters)).ravel()
-        # both index lists ascend, so a lower triangle lands in the lower triangle
-        total.information[np.ix_(rows, rows)] += weight * sums.information
+        add_into(total.information, sums.information, at, parameters, weight)
         total.vector[rows] += weight * sums.vector
         misclosure += weight * sums.misclosure
         redundancy += sums.redundancy
@@ -107,10 +109,9 @@ def factor(sums: Sums, rows: Index, images: ImageSet) -> SubMin:
     by_id = np.argsort(np.array(images.ids, dtype=np.str_))
     rank, p = np.argsort(by_id), images.parameters
     estimate = estimate_images(reordered(sums, by_id, p), images.take(by_id).prior, p)
-    covariance = estimate.covariance
-    if not np.array_equal(rank, np.arange(len(rank))):
-        at = (rank[:, None] * p + np.arange(p)).ravel()
-        covariance = covariance[np.ix_(at, at)]
+    at = (rank[:, None] * p + np.arange(p)).ravel()
+    # the estimate ends here, so its factor may become the inverse, and rows of K in the order of the rows need no other permutation
+    covariance = covariance_of(estimate.factor, sp.csr_array(estimate.prior[at]))
     return SubMin(rows, estimate.theta[rank], covariance, estimate.chi_square, sums.redundancy)
 
 
@@ -123,21 +124,35 @@ def locate(part: GroundPart, sub_min: SubMin) -> Array:
 
 def loadings(parts: Sequence[GroundPart], images: Index, parameters: int) -> sp.csr_array:
     """U (3n, m p) of all points of some parts on ``images`` (rows of the network, ascending), sparse."""
-    data, rows, columns = [], [], []
-    shift = 0
+    shape = (3 * sum(len(part.origin) for part in parts), len(images) * parameters)
+    if not parts:
+        return sp.csr_array(shape)
+    data, columns, lengths = [], [], []
     for part in parts:
-        n = len(part.origin)
-        point = shift + np.repeat(np.arange(n), np.diff(part.linear.first))
+        first = part.linear.first
         at = np.searchsorted(images, part.linear.image)
-        shape = part.factors.loading.shape
-        rows.append(np.broadcast_to((3 * point[:, None] + np.arange(3))[:, :, None], shape).ravel())
-        columns.append(np.broadcast_to((parameters * at[:, None] + np.arange(parameters))[:, None, :], shape).ravel())
-        data.append(part.factors.loading.ravel())
-        shift += n
-    shape2 = (3 * shift, len(images) * parameters)
-    if not data:
-        return sp.csr_array(shape2)
-    return sp.coo_array((np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))), shape=shape2).tocsr()
+        values, places = _by_coordinate(first, at, part.factors.loading)
+        data.append(values)
+        columns.append(places)
+        lengths.append(np.repeat(np.diff(first) * parameters, 3))
+    offsets = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
+    small = offsets[-1] <= np.iinfo(np.int32).max
+    return sp.csr_array((np.concatenate(data), np.concatenate(columns), offsets.astype(np.int32 if small else np.int64)), shape=shape)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _by_coordinate(first: Rows, at: Rows, loading: Array) -> tuple[Array, Index]:
+    """Loadings (r, 3, p) by ray, put by coordinate of each point: values, and columns where the rays' images begin at ``at`` (r,)."""
+    p = loading.shape[2]
+    values, columns = np.empty(loading.size), np.empty(loading.size, np.int32)
+    k = 0
+    for j in range(len(first) - 1):
+        for c in range(3):
+            for i in range(first[j], first[j + 1]):
+                for u in range(p):
+                    values[k], columns[k] = loading[i, c, u], at[i] * p + u
+                    k += 1
+    return values, columns
 
 
 def joint_covariance(loading: sp.csr_array, own: Array, covariance: Array) -> Array:
@@ -163,11 +178,42 @@ def joint_covariance(loading: sp.csr_array, own: Array, covariance: Array) -> Ar
 
 def point_covariances(loading: sp.csr_array, own: Array, covariance: Array) -> Array:
     """Covariance (n, 3, 3) of each point by itself, without the joint matrix; arguments as in `joint_covariance`."""
-    n, chunk = len(own), 2048
     covariances = own.copy()
-    for start in range(0, n, chunk):
-        u = loading[3 * start : 3 * min(start + chunk, n)]
-        seen = np.unique(u.indices)
-        rows = u[:, seen].toarray().reshape(-1, 3, len(seen))
-        covariances[start : start + chunk] += (rows @ covariance[np.ix_(seen, seen)]) @ rows.transpose(0, 2, 1)
+    _add_point_covariances(loading.indptr.astype(np.int64), loading.indices.astype(np.int32), loading.data, covariance, covariances)
     return covariances
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _add_point_covariances(first: Rows, column: Index, value: Array, covariance: Array, total: Array) -> None:
+    """Add ``U M U'`` of each point to (n, 3, 3), entry by entry of U: a point loads on a handful of images."""
+    for j in range(len(total)):
+        start, count = first[3 * j], first[3 * j + 1] - first[3 * j]
+        alike = first[3 * j + 3] - start == 3 * count and first[3 * j + 2] - start == 2 * count
+        if alike:
+            for a in range(start, start + count):
+                alike = alike and column[a] == column[a + count] and column[a] == column[a + 2 * count]
+        if alike:  # the three coordinates load on the same parameters: each entry of M is fetched once
+            own = total[j]
+            for a in range(start, start + count):
+                row, x, y, z = covariance[column[a]], 0.0, 0.0, 0.0
+                for b in range(start, start + count):
+                    m = row[column[b]]
+                    x += m * value[b]
+                    y += m * value[b + count]
+                    z += m * value[b + 2 * count]
+                u, v, w = value[a], value[a + count], value[a + 2 * count]
+                own[0, 0] += u * x
+                own[1, 0] += v * x
+                own[1, 1] += v * y
+                own[2, 0] += w * x
+                own[2, 1] += w * y
+                own[2, 2] += w * z
+        else:
+            for c in range(3):
+                for d in range(c + 1):
+                    for a in range(first[3 * j + c], first[3 * j + c + 1]):
+                        row, part = covariance[column[a]], 0.0
+                        for b in range(first[3 * j + d], first[3 * j + d + 1]):
+                            part += row[column[b]] * value[b]
+                        total[j, c, d] += value[a] * part
+        total[j, 0, 1], total[j, 0, 2], total[j, 1, 2] = total[j, 1, 0], total[j, 2, 0], total[j, 2, 1]

@@ -74,7 +74,7 @@ def control_of_block(
 ) -> NetworkControl | None:
     """Those of a block's points ``ids`` (in ``cells``, see `points_named`) that a network can answer for, as control; None without any.
 
-    ``most``: at most so many, well spread. ``network_images`` is the number of images in the network.
+    ``most``: at most so many, well spread and well determined. ``network_images`` is the number of images in the network.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def control_of_block(
     check_policy(policy)
     selections, _ = points_named(source, ids, cells)
     if most is not None:
-        selections = well_spread(selections, most)
+        selections = well_spread(source, selections, most)
     kept, parts = determined_parts(source, selections)
     if not parts:
         return None
@@ -126,11 +126,15 @@ class _Joined:
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         wanted = np.asarray(rows, dtype=np.int32)
         known, new = self.source.image_set(wanted[wanted < self.rows[0]]), self.block.take(wanted[wanted >= self.rows[0]] - self.rows[0])
-        width = max(known.cameras.shape[1], new.cameras.shape[1])
-        cameras = np.full((len(known) + len(new), width), np.nan)
-        cameras[: len(known), : known.cameras.shape[1]] = known.cameras
-        cameras[len(known) :, : new.cameras.shape[1]] = new.cameras
-        return ImageSet(
-            known.ids + new.ids, known.sensors + new.sensors, cameras, known.priors + new.priors,
-            self.block.parameters, self.block.ellipsoid,
-        )  # fmt: skip
+        return both(known, new)
+
+
+def both(known: ImageSet, new: ImageSet) -> ImageSet:
+    """Images of a network followed by those of a block, with the block's number of parameters."""
+    width = max(known.cameras.shape[1], new.cameras.shape[1])
+    cameras = np.full((len(known) + len(new), width), np.nan)
+    cameras[: len(known), : known.cameras.shape[1]] = known.cameras
+    cameras[len(known) :, : new.cameras.shape[1]] = new.cameras
+    return ImageSet(
+        known.ids + new.ids, known.sensors + new.sensors, cameras, known.priors + new.priors, new.parameters, new.ellipsoid,
+    )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from submin.adjustment.estimation import fill_symmetric
+from submin.adjustment.symmetric import fill_symmetric
 from submin.network.dense_sub_min import DenseSubMin
 from submin.network.observations import Cluster
 from submin.network.triangle import PANEL, Triangle

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import date
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +16,38 @@ from shapely.geometry.base import BaseGeometry
 
 from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
+from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
 from submin.network.cell import Cell, widened_sums
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import GroundPart, SubMin
+from submin.network.thinning import reported_points
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import cross_covariance
-from submin.query.planner import Answer, answer, determined_parts, points_in_area, points_named, points_of_tile, well_spread
+from submin.query.planner import (
+    Answer,
+    Selection,
+    all_points,
+    answer,
+    determined_parts,
+    points_in_area,
+    points_named,
+    points_of_tile,
+    well_spread,
+)
+from submin.query.point_metadata import PointMetadata, metadata_of_points
+from submin.query.with_block import BlockRays, TileWithBlock, with_block
+from submin.sensors import width_of
 from submin.storage.arrays import group_of, read_record
+from submin.storage.block_images import network_images
+from submin.storage.catalogue_schema import Block
+from submin.storage.check_points import check_points
+from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
+from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
+from submin.storage.validity import Validity, today
 from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
@@ -81,6 +105,7 @@ class Network:
         tile: str | None = None,
         policy: str = "auto",
         max_points: int | None = None,
+        on: date | None = None,
     ) -> ControlSet:
         """Control points with their joint covariance.
 
@@ -91,21 +116,82 @@ class Network:
         points : ids of points
         tile : name of a tile; alone, all points that it holds
         policy : ``auto``, ``tile``, ``ci``, ``bci``, ``split`` or ``rigorous`` (docs/accuracy.md)
-        max_points : at most so many, well spread and seen by many rays
+        max_points : at most so many, well spread and well determined
+        on : day on which points must be valid; default: today (UTC)
+
+        An area or a tile is answered by the points that the network reports: those that thinning leaves, and that are valid on the day.
+        Points that are asked for by their ids are answered whether it reports them or not (docs/points.md).
 
         Raises
         ------
         QueryError
-            When nothing or too much is asked, a policy, tile or point is unknown, or a box is not one.
+            When nothing or too much is asked, a policy, tile or point is unknown, a box is not one, or ``max_points`` is below 1.
         """
-        asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
-        if len(asked) > 1 or (not asked and tile is None):
-            raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
+        if self._dense is not None:
+            return self._query_dense(self._dense, bbox, area, points, tile, policy, max_points)
+        selections, number = self._selected(bbox, area, points, tile, max_points, today() if on is None else on)
+        return self.control_set(answer(self, selections, policy, number))
+
+    def export(
+        self,
+        path: str | Path,
+        *,
+        bbox: tuple[float, float, float, float] | None = None,
+        area: BaseGeometry | None = None,
+        tile: str | None = None,
+        policy: str = "auto",
+        max_points: int | None = None,
+        family: str = AUTO,
+        rank: int = 0,
+        floor: float | None = None,
+    ) -> CompactControl:
+        """Write control points with a compact joint covariance: 3 x 3 blocks and correlation functions (docs/correlation.md).
+
+        Parameters
+        ----------
+        path : file to write, ``.parquet``
+        bbox, area, tile, policy, max_points : which points, as in `query`; without any of the first three all points
+        family, rank, floor : as in `ControlSet.compact`
+
+        Returns
+        -------
+        CompactControl
+            What `read_compact` reads from the file.
+
+        Raises
+        ------
+        QueryError
+            As `query` does.
+        InputError
+            When the family is unknown, there are too few or too many points, rank or floor are out of range, or the file cannot be
+            written; nothing is written then.
+        """
+        check_suffix(path)
+        check_asked(family, rank, floor)
+        if self._dense is not None:
+            everything = self.cover.tile_name(0) if bbox is None and area is None and tile is None else tile
+            control = self._query_dense(self._dense, bbox, area, None, everything, policy, max_points)
+            check_size(len(control))
+            return write_compact(path, control, control.compact(family, rank, floor))
+        if bbox is None and area is None and tile is None:
+            selections, number = self._reported(all_points(self), today()), None
+            if max_points is not None:
+                selections = well_spread(self, selections, max_points)
+        else:
+            selections, number = self._selected(bbox, area, None, tile, max_points, today())
+        check_size(sum(len(s.rows) for s in selections))  # before a joint covariance of that size is made
+        control = self.control_set(answer(self, selections, policy, number))
+        return write_compact(path, control, control.compact(family, rank, floor))
+
+    def _selected(
+        self, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None, points: Sequence[str] | NDArray[np.str_] | None,
+        tile: str | None, max_points: int | None, on: date,
+    ) -> tuple[list[Selection], int | None]:  # fmt: skip
+        """Points that are asked for, and the number of the tile that is named."""
+        _check_asked(bbox, area, points, tile)
         number = None if tile is None else self.cover.tile_number(tile)
         if bbox is not None:
             area = box_area(bbox)
-        if self._dense is not None:
-            return self._query_dense(self._dense, area, points, policy, max_points)
         if area is not None:
             selections = points_in_area(self, area)
             if not selections and _inside_when_swapped(area, self.cover):
@@ -126,14 +212,96 @@ class Network:
         if number is not None:
             held = set(self.cover.cells_held(number))
             selections = [s for s in selections if s.cell.number in held]
+        if points is None:
+            selections = self._reported(selections, on)
         if max_points is not None:
-            selections = well_spread(selections, max_points)
-        return self._control_set(answer(self, selections, policy, number))
+            selections = well_spread(self, selections, max_points)
+        return selections, number
+
+    def points(
+        self,
+        *,
+        bbox: tuple[float, float, float, float] | None = None,
+        area: BaseGeometry | None = None,
+        points: Sequence[str] | NDArray[np.str_] | None = None,
+        tile: str | None = None,
+    ) -> PointMetadata:
+        """What is known of points beside their coordinates: pending, thinned and retired ones too. Columns and units: docs/points.md.
+
+        Parameters
+        ----------
+        bbox, area, points, tile : exactly one of them, as of `query`; a point that its rays do not determine is where it is registered
+
+        Raises
+        ------
+        QueryError
+            When nothing or too much is asked, a tile or point is unknown, or a box is not one.
+        """
+        refuse_dense(self._snapshot, "metadata of points")
+        asked = [n for n, value in (("bbox", bbox), ("area", area), ("points", points), ("tile", tile)) if value is not None]
+        if len(asked) != 1:
+            raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, tile")
+        area = area if bbox is None else box_area(bbox)
+        if area is not None:
+            selections = points_in_area(self, area, every=True)
+        elif points is not None:
+            selections = self.named(points)
+        else:
+            assert tile is not None
+            selections = points_of_tile(self, self.cover.tile_number(tile), every=True)
+        snapshot = self._snapshot
+        found = metadata_of_points(self, selections, image_facts(snapshot), check_points(snapshot), snapshot.metadata.thinning)
+        if area is not None:
+            found = found.take(np.asarray(shapely.intersects_xy(area, found.geodetic[:, 0], found.geodetic[:, 1]), dtype=bool))
+        valid_from, valid_to, reason = self.validity.rows_of(found.ids)
+        return replace(
+            found, valid_from=valid_from, valid_to=valid_to, reason=reason, epoch=snapshot.metadata.epoch, version=self.version
+        )  # fmt: skip
+
+    def named(self, points: Sequence[str] | NDArray[np.str_]) -> list[Selection]:
+        """Points by their ids, determined or not.
+
+        Raises
+        ------
+        QueryError
+            When the network does not have one of them.
+        """
+        refuse_dense(self._snapshot, "what is known of single points")
+        ids = np.unique(np.asarray(points, dtype=np.str_))
+        selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids), every=True)
+        if len(missing):
+            shown = f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+            raise QueryError(f"{len(missing)} of {len(ids)} points are not in the network: {shown}; expected ids of its points")
+        return selections
+
+    @cached_property
+    def validity(self) -> Validity:
+        """From when to when points are valid."""
+        return Validity.of(self._snapshot)
+
+    def left_by_thinning(self, cell: Cell) -> NDArray[np.bool_]:
+        """True (n,) for the points of a cell that thinning leaves in answers for areas and tiles."""
+        return reported_points(cell, self.cover, self._snapshot.metadata.thinning)
+
+    def _reported(self, selections: Sequence[Selection], on: date) -> list[Selection]:
+        """Those of some points that are not thinned, and valid on a day."""
+        if not self._snapshot.metadata.thinning and not len(self.validity):
+            return list(selections)
+        kept = []
+        for s in selections:
+            reported = self.left_by_thinning(s.cell) & self.validity.valid(s.cell.point_ids, on)
+            kept.append(Selection(s.cell, s.rows[reported[s.rows]]))
+        return [s for s in kept if len(s.rows)]
 
     def _query_dense(
-        self, dense: DenseReader, area: BaseGeometry | None, points: Sequence[str] | NDArray[np.str_] | None, policy: str, most: int | None
-    ) -> ControlSet:
+        self, dense: DenseReader, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None,
+        points: Sequence[str] | NDArray[np.str_] | None, tile: str | None, policy: str, most: int | None,
+    ) -> ControlSet:  # fmt: skip
         """Answer of a dense network; its one tile holds every point."""
+        _check_asked(bbox, area, points, tile)
+        if tile is not None:
+            self.cover.tile_number(tile)  # an unknown one is refused
+        area = area if bbox is None else box_area(bbox)
         if area is not None:
             rows = dense.in_area(area)
             if not len(rows) and _inside_when_swapped(area, self.cover):
@@ -239,7 +407,8 @@ class Network:
         self._images.update(zip(unread, self._snapshot.images(unread), strict=True))
         return image_set([self._images[int(row)] for row in rows], self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
 
-    def _control_set(self, found: Answer) -> ControlSet:
+    def control_set(self, found: Answer) -> ControlSet:
+        """An answer as users get it; images behind it that are not in the network have no block there."""
         metadata, cover = self._snapshot.metadata, self.cover
         blocks = self._snapshot.image_columns(["block_id"])["block_id"] if len(found.images) else np.empty(0, dtype="U1")
         return ControlSet(
@@ -254,8 +423,9 @@ class Network:
             tile_of_point=np.array([cover.tile_name(t) for t in found.owner], dtype=np.str_),
             rays=found.rays,
             version=self.version,
-            blocks=tuple(np.unique(blocks[found.images]).tolist()) if len(found.images) else (),
+            blocks=tuple(np.unique(blocks[found.images[found.images < len(blocks)]]).tolist()),
             scope="network" if found.network_wide else "tiles",
+            validity=self.validity.intervals(found.ids),
         )
 
 
@@ -277,6 +447,81 @@ class TileView:
     def covariance(self, ids: Sequence[str]) -> Array:
         """Joint covariance (3n, 3n) of points, geocentric square metres, in the order of their ids ascending, from this sub-MIN alone."""
         return self.query(ids).covariance
+
+    def with_block(self, block: Block) -> TilePreview:
+        """What a block that is not in the network would bring to this sub-MIN alone: fused in memory, nothing is written.
+
+        Its rays are taken as they are, where a run would judge them; points that the network holds in other tiles only take no part.
+
+        Raises
+        ------
+        QueryError
+            When an image of the block is in the network already, or none of its rays falls into the tile.
+        """
+        images = network_images(block)
+        opened = self._network
+        width = width_of(image.sensor for image in images)
+        if width > opened.snapshot.metadata.parameters:
+            opened = Network(opened.snapshot.place, opened.version, width)
+        names = opened.snapshot.image_columns(["image_id"])["image_id"] if opened.snapshot.image_count() else np.empty(0, dtype="U1")
+        twice = [image.image_id for image in images if image.image_id in names]
+        if twice:
+            raise QueryError(f"image {twice[0]} of block {block.block_id} is in the network already; expected a block that is not")
+        ids = np.unique(block.point_ids)
+        rays = BlockRays(
+            image_set(images, opened.snapshot.metadata.ellipsoid, opened.snapshot.metadata.parameters), block.point_ids, block.image,
+            np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line]),
+        )  # fmt: skip
+        elsewhere = ids[opened.snapshot.candidate_cells(ids) >= 0]
+        return TilePreview(opened, with_block(opened, self._number, rays, elsewhere, opened.snapshot.image_count()))
+
+
+class TilePreview:
+    """One sub-MIN with a block in it that is not in the network."""
+
+    def __init__(self, network: Network, source: TileWithBlock) -> None:
+        self._network, self._source = network, source
+
+    @property
+    def chi_square(self) -> float:
+        """By how much the block adds to the weighted squares of the tile: chi-square when block and tile agree."""
+        return self._source.fused.chi_square
+
+    @property
+    def redundancy(self) -> int:
+        """Degrees of freedom of ``chi_square``."""
+        return self._source.fused.redundancy
+
+    @property
+    def rank(self) -> int:
+        """Directions in which the block changes what is known of the images."""
+        return self._source.fused.rank
+
+    def query(self, ids: Sequence[str] | None = None) -> ControlSet:
+        """Control points of this sub-MIN with the block: those named, or all that the tile and the block determine.
+
+        Raises
+        ------
+        QueryError
+            When a point named is not in the tile, or not determined.
+        """
+        selections = points_of_tile(self._source, self._source.tile)
+        if ids is not None:
+            wanted = np.unique(np.asarray(ids, dtype=np.str_))
+            selections = [Selection(s.cell, s.rows[np.isin(s.cell.point_ids[s.rows], wanted)]) for s in selections]
+            selections = [s for s in selections if len(s.rows)]
+            found = np.concatenate([s.cell.point_ids[s.rows] for s in selections] or [wanted[:0]])
+            missing = np.setdiff1d(wanted, found)
+            if len(missing):
+                raise QueryError(f"{len(missing)} of {len(wanted)} points are not determined in the tile, {missing[0]} among them")
+        return self._network.control_set(answer(self._source, selections, "tile", self._source.tile))
+
+
+def _check_asked(bbox: object, area: object, points: object, tile: str | None) -> None:
+    """Refuse a query by nothing, or by more than one of box, area and points."""
+    asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
+    if len(asked) > 1 or (not asked and tile is None):
+        raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
 
 
 def box_area(bbox: tuple[float, float, float, float]) -> BaseGeometry:

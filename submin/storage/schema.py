@@ -11,8 +11,8 @@ import zarr
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import Sums
-from submin.adjustment.estimation import fill_symmetric
 from submin.adjustment.rays import Rays
+from submin.adjustment.symmetric import fill_symmetric
 from submin.errors import StoreError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, widened
@@ -51,6 +51,7 @@ class NetworkMetadata:
     parameters : adjustable parameters kept for each image; later versions may keep more, when a sensor comes that has them
     max_parameters : a tile that would hold more image parameters is split, where its overlap lets it
     format_version : of the store
+    thinning : side in metres of the squares of which one point each is reported; 0 reports every point (decision 013)
     """
 
     name: str
@@ -64,6 +65,7 @@ class NetworkMetadata:
     parameters: int = 6
     max_parameters: int = 2500
     format_version: int = FORMAT_VERSION
+    thinning: float = 0.0
 
     @property
     def ellipsoid(self) -> Ellipsoid:

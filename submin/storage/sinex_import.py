@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.constraint_removal import information_of, without_constraint
+from submin.adjustment.constraint_removal import Freed, information_of, without_constraint
 from submin.errors import InputError, NumericalError
 from submin.formats.sinex import Matrix, Parameter, SinexFile, read_sinex
 from submin.geodesy import WGS84, geocentric_to_geodetic, local_axes, rotate_covariance
@@ -132,44 +132,20 @@ def _of_gnss(path: Path) -> _Solution:
 def _of_sinex(path: Path, file: SinexFile, keep_constraints: bool) -> _Solution:
     notes: list[str] = []
     ids, rows, epoch = _stations(path, file, notes)
-    values = np.array([parameter.value for parameter in file.estimate])
     covariance = _estimate_covariance(path, file)
     scale = _checked_sigmas(path, file, covariance, notes)
-    constraint, share = "none", 0.0
-    stated = _CONSTRAINTS.get(file.constraint)
+    values = np.array([parameter.value for parameter in file.estimate])
     if file.variance_factor is not None:
         notes.append(
             f"the file states a variance factor of {file.variance_factor:.6g}; the covariance is taken as it stands, not multiplied"
         )
-    if file.a_priori_matrix is not None:
-        if keep_constraints:
-            constraint = "kept"
-            notes.append("the a priori constraint is kept: control of this file is as accurate as it says only if the constraint is")
-        else:
-            information = _information(path, file, file.a_priori_matrix)
-            held = np.diagonal(information) > 0.0
-            a_priori = np.where(held, file.a_priori_values, values)
-            try:
-                freed = without_constraint(values, covariance, a_priori, information, file.matrix.digits)
-            except NumericalError as error:
-                raise InputError(
-                    f"{path}: line {file.a_priori_matrix.line}: {error}. Take it as it stands by --keep-constraints, "
-                    "which holds the datum by the constraint"
-                ) from None
-            moved = float(np.abs(freed.estimate - values)[rows].max())
-            growth = float(np.sqrt(np.diagonal(freed.covariance) / np.diagonal(covariance))[rows].max())
-            values, covariance, constraint, share = freed.estimate, freed.covariance, "removed", freed.share
-            notes.append(
-                f"the a priori constraint is removed: it was {share:.2g} of the information in one direction at most; "
-                f"coordinates move by {moved:.2g} m at most, standard deviations grow by a factor of {growth:.7g} at most"
-            )
-            if stated and share < 0.5:
-                notes.append(
-                    f"the header calls the constraints {stated} (code {file.constraint}), but those that it states are loose: "
-                    "what else holds the datum (orbits, for instance) is not in the file and stays in the estimate"
-                )
-    elif stated or any(parameter.sigma > 0.0 for parameter in file.a_priori):
-        said = f"the header calls the constraints {stated} (code {file.constraint})" if stated else "the file states a priori sigmas"
+    constraint, share = "none", 0.0
+    said = _said_constraint(file)
+    if file.a_priori_matrix is not None and not keep_constraints:
+        freed = _freed(path, file, file.a_priori_matrix, values, covariance)
+        notes += _removal_notes(file, freed, values[rows], covariance, rows)
+        values, covariance, constraint, share = freed.estimate, freed.covariance, "removed", freed.share
+    elif said:
         if not keep_constraints:
             raise InputError(
                 f"{path}: line 1: {said}, and there is no SOLUTION/MATRIX_APRIORI to take them out; expected the constraint, or none. "
@@ -179,6 +155,43 @@ def _of_sinex(path: Path, file: SinexFile, keep_constraints: bool) -> _Solution:
         notes.append(f"{said}; they are kept: control of this file is as accurate as it says only if the constraint is")
     geocentric = values[rows].reshape(-1, 3)
     return _Solution(ids, geocentric, scale * covariance[np.ix_(rows, rows)], "", epoch, constraint, share, tuple(notes))
+
+
+def _said_constraint(file: SinexFile) -> str:
+    """What a file says of constraints in its estimate; empty when it says that there are none."""
+    if file.constraint in _CONSTRAINTS:
+        return f"the header calls the constraints {_CONSTRAINTS[file.constraint]} (code {file.constraint})"
+    if file.a_priori_matrix is not None:
+        return "the file states the matrix of its a priori constraints"
+    return "the file states a priori sigmas" if any(parameter.sigma > 0.0 for parameter in file.a_priori) else ""
+
+
+def _freed(path: Path, file: SinexFile, matrix: Matrix, values: Array, covariance: Array) -> Freed:
+    """The estimate without its constraint."""
+    information = _information(path, file, matrix)
+    a_priori = np.where(np.diagonal(information) > 0.0, file.a_priori_values, values)
+    try:
+        return without_constraint(values, covariance, a_priori, information, file.matrix.digits)
+    except NumericalError as error:
+        raise InputError(
+            f"{path}: line {matrix.line}: {error}. Take it as it stands by --keep-constraints, which holds the datum by the constraint"
+        ) from None
+
+
+def _removal_notes(file: SinexFile, freed: Freed, coordinates: Array, covariance: Array, rows: NDArray[np.int64]) -> list[str]:
+    """What the removal has changed of the coordinates."""
+    moved = float(np.abs(freed.estimate[rows] - coordinates).max())
+    growth = float(np.sqrt(np.diagonal(freed.covariance)[rows] / np.diagonal(covariance)[rows]).max())
+    notes = [
+        f"the a priori constraint is removed: it was {freed.share:.2g} of the information in one direction at most; "
+        f"coordinates move by {moved:.2g} m at most, standard deviations grow by a factor of {growth:.7g} at most"
+    ]
+    if file.constraint in _CONSTRAINTS and freed.share < 0.5:
+        notes.append(
+            f"{_said_constraint(file)}, but those that it states are loose: "
+            "what else holds the datum (orbits, for instance) is not in the file and stays in the estimate"
+        )
+    return notes
 
 
 def _stations(path: Path, file: SinexFile, notes: list[str]) -> tuple[list[str], NDArray[np.int64], str]:

@@ -24,8 +24,9 @@ from submin.adjustment.elimination import (
     point_factors,
     residuals_of,
 )
-from submin.adjustment.estimation import ImageEstimate, cholesky, estimate_images, fill_symmetric, reduced_information
+from submin.adjustment.estimation import ImageEstimate, cholesky, estimate_images, reduced_information
 from submin.adjustment.priors import APriori, ImagePrior, prior_factor, prior_variance
+from submin.adjustment.symmetric import fill_symmetric
 from submin.errors import NumericalError
 from submin.sensors import sensor_named
 

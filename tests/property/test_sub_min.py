@@ -239,6 +239,17 @@ def test_point_covariances_are_the_blocks_of_the_joint_one() -> None:
             assert_close(blocks[start + k], joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], 1e-12)
 
 
+def test_point_covariances_of_loadings_on_other_images_by_coordinate() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(12, 12))
+    covariance, own = root @ root.T, np.tile(np.eye(3), (5, 1, 1))
+    loading = sp.random_array((15, 12), density=0.4, rng=rng, format="csr")
+    joint = joint_covariance(loading, own, covariance)
+    blocks = point_covariances(loading, own, covariance)
+    for k in range(5):
+        assert_close(blocks[k], joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], 1e-12)
+
+
 def test_a_query_of_some_points_is_the_marginal_of_all() -> None:
     rays = random_rays(8)
     _, _, joint = answer(rays, np.zeros(rays.points, dtype=np.int64))

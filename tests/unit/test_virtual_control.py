@@ -10,11 +10,12 @@ import scipy.linalg as la
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import eliminate, linearise
-from submin.adjustment.estimation import estimate_images, fill_symmetric
+from submin.adjustment.estimation import estimate_images
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori
 from submin.adjustment.rays import Rays, sorted_rays
+from submin.adjustment.symmetric import fill_symmetric
 from submin.adjustment.virtual_control import VirtualControl, VirtuallyControlled, adjust_virtually, virtual_control, virtual_factor
 from submin.errors import InputError
 from submin.geodesy import geodetic_to_geocentric, local_axes
