@@ -221,6 +221,8 @@ def _control(
     p = judged.images.parameters
     if network is not None:
         opened = Network(network, version, p)
+        if opened.dense is not None:
+            return _dense_control(judged, opened, policy, most)
         cells = opened.snapshot.candidate_cells(judged.ids)
         control = control_of_block(opened, judged.ids, cells, policy, opened.snapshot.image_count(), most)
         if control is not None:
@@ -247,6 +249,18 @@ def _control(
     axes = local_axes(table.geodetic[row])
     covariance = np.swapaxes(axes, 1, 2) @ table.covariance_enu[row] @ axes
     return (lambda images: surveyed(images.prior, p, point, position, covariance)), _Source("survey", policy="survey")
+
+
+def _dense_control(judged: _Judged, network: Network, policy: str, most: int) -> tuple[Callable[[ImageSet], ControlledPrior], _Source]:
+    """Points of a dense network, with their joint covariance: nothing of the block is in it, nor of its passes."""
+    p, place = judged.images.parameters, network.snapshot.place
+    common = np.empty(0, dtype=np.str_) if network.dense is None else network.dense.held(judged.ids)
+    if not len(common):
+        return (lambda images: uncontrolled(images.prior, p)), _Source("network", place, network.version)
+    found = network.query(points=common, policy=policy, max_points=most)
+    point = np.searchsorted(judged.ids, found.ids)
+    source = _Source("network", place, found.version, found.policy, found.tiles)
+    return (lambda images: correlated(images.prior, p, point, found.geocentric, found.covariance)), source
 
 
 def _values(judged: _Judged, result: ControlledAdjustment, points: int, shown: int, source: _Source) -> dict[str, Any]:

@@ -66,7 +66,10 @@ def check(network: Network, points: PointTable, policy: str, advance: Callable[[
         When the network holds none of the check points, or all are its control.
     """
     order = np.argsort(points.point_ids)
-    controlled = np.isin(points.point_ids[order], Ledger.of(network.snapshot).control_points())
+    if network.dense is not None:
+        policy = "tile"  # the one that there is
+    surveyed = Ledger.of(network.snapshot).control_points() if network.dense is None else network.dense.control_points
+    controlled = np.isin(points.point_ids[order], surveyed)
     order = order[~controlled]
     ids = points.point_ids[order]
     if controlled.any() and not len(ids):

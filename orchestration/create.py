@@ -13,18 +13,27 @@ from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
 from submin.formats.columns import required_path
+from submin.geodesy import Ellipsoid, geocentric_to_geodetic
+from submin.network.observations import Stack
 from submin.sensors import width_of
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata
+from submin.storage.dense_store import create_dense
 from submin.storage.image_footprints import image_footprints
 from submin.storage.network_store import create_network
 from submin.storage.schema import NetworkMetadata
 from submin.tiling.cover import Cover, check_on_globe, cover_area
 from submin.tiling.footprints import footprint_widths, on_globe
 
+FORMS = ("factored", "dense")
 DEFAULT_CORE_KM = 100.0
 CORE_IN_FOOTPRINTS = 4.0
 """With ``--fit`` a core is so many median footprint widths wide, and neighbours share one."""
+
+ALL_METRES = 4e7
+"""Side of a core that holds every area that has a plane."""
+ONE_TILE_MARGIN, LEAST_TILE_METRES = 1.1, 1000.0
+POINTS_MARGIN_DEGREES = 0.01
 
 
 @dataclass(frozen=True)
@@ -65,20 +74,57 @@ def create(
     StoreError
         When something is already at the place.
     """
-    if form != "factored":
-        raise InputError(f"form is {form!r}; this release makes 'factored' networks")
+    if form not in FORMS:
+        raise InputError(f"form is {form!r}; expected one of {', '.join(FORMS)}")
     if thin_metres is not None and not (np.isfinite(thin_metres) and thin_metres > 0.0):
         raise InputError(f"--thin-metres is {thin_metres:g}; expected a positive length, or none of this option to report every point")
-    core = 1000.0 * (DEFAULT_CORE_KM if tile_km is None else tile_km)
-    overlap = 0.25 * core if overlap_km is None else 1000.0 * overlap_km
-    cover = cover_area(area, core, overlap, metadata.ellipsoid)
+    if form == "dense":
+        if tile_km is not None or overlap_km is not None:
+            raise InputError("--tile-km and --overlap-km say nothing of a dense network, which has one tile; leave them out")
+        if thin_metres is not None:
+            raise InputError("--thin-metres is given for a dense network, which reports every point; leave it out")
+        cover = one_tile(area, metadata.ellipsoid)
+    else:
+        core = 1000.0 * (DEFAULT_CORE_KM if tile_km is None else tile_km)
+        overlap = 0.25 * core if overlap_km is None else 1000.0 * overlap_km
+        cover = cover_area(area, core, overlap, metadata.ellipsoid)
     network = NetworkMetadata(
         name=Path(place).name, body=metadata.body, frame=metadata.frame, epoch=metadata.epoch,
         semimajor_axis=metadata.semimajor_axis, flattening=metadata.flattening, cover=cover.to_mapping(), form=form,
         parameters=width_of(["rpc"]), max_parameters=max_parameters, thinning=thin_metres or 0.0,
     )  # fmt: skip
-    create_network(place, network)
+    create_network(place, network, create_dense if form == "dense" else None)
     return Created(place, cover, network)
+
+
+def one_tile(area: BaseGeometry, ellipsoid: Ellipsoid) -> Cover:
+    """The cover of a dense network: one core around all of an area."""
+    plane = cover_area(area, ALL_METRES, 0.25 * ALL_METRES, ellipsoid)
+    outline = shapely.get_coordinates(shapely.segmentize(area, max(0.01 * float(np.ptp(area.bounds)), 1e-9)))
+    side = ONE_TILE_MARGIN * max(float(np.ptp(v)) for v in plane.plane(outline[:, 0], outline[:, 1])) + LEAST_TILE_METRES
+    return cover_area(area, side, 0.25 * side, ellipsoid)
+
+
+def fit_points(catalogue: Catalogue) -> BaseGeometry:
+    """Area of the points of a catalogue without images: its observations and control.
+
+    Raises
+    ------
+    InputError
+        When they place no point: baselines alone.
+    """
+    clusters, control = tuple(catalogue.observations()), catalogue.points("control")
+    places = [] if control is None else [control.geodetic]
+    if clusters:
+        every = Stack(clusters)
+        at = every.approximate(np.full((len(every.point_ids), 3), np.nan))
+        places.append(geocentric_to_geodetic(at[np.isfinite(at[:, 0])], catalogue.metadata.ellipsoid))
+    geodetic = np.concatenate(places) if places else np.empty((0, 3))
+    if not len(geodetic):
+        raise InputError(f"{catalogue.path}: places no point (baselines alone have no position); give the area by --bbox or --aoi")
+    west, south = geodetic[:, :2].min(axis=0) - POINTS_MARGIN_DEGREES
+    east, north = geodetic[:, :2].max(axis=0) + POINTS_MARGIN_DEGREES
+    return shapely.box(west, max(south, -90.0), east, min(north, 90.0))
 
 
 def read_area(path: Path) -> BaseGeometry:

@@ -9,11 +9,14 @@ import numpy as np
 
 from submin import Network
 from submin.storage.accuracy_map import accuracy_of_all
+from submin.storage.dense_reader import DenseReader
 from submin.storage.ledger import Ledger
 
 
 def describe(network: Network) -> dict[str, Any]:
     """Numbers of ``submin info``: counts, median accuracy, size."""
+    if network.dense is not None:
+        return _describe_dense(network, network.dense)
     snapshot = network.snapshot
     cells = [snapshot.cell_attributes(number) for number in network.cell_numbers()]
     images = snapshot.image_columns(["image_id", "sensor", "released", "withdrawn"])
@@ -21,8 +24,6 @@ def describe(network: Network) -> dict[str, Any]:
     ledger = Ledger.of(snapshot)
     accuracy = accuracy_of_all(network)
     reported = ~accuracy.thinned & ~accuracy.retired
-    place = snapshot.place
-    size = sum(f.stat().st_size for f in Path(place).rglob("*") if f.is_file()) if "://" not in place else -1
     return {
         "version": network.version,
         "points": len(accuracy.ids),
@@ -45,5 +46,35 @@ def describe(network: Network) -> dict[str, Any]:
         "overlap_km": network.cover.overlap / 1000.0,
         "thin_metres": snapshot.metadata.thinning,
         "frame": snapshot.metadata.frame,
-        "bytes": size,
+        "bytes": _size(snapshot.place),
     }
+
+
+def _describe_dense(network: Network, dense: DenseReader) -> dict[str, Any]:
+    """Of a dense network: what it is about, and how well all of it fits together."""
+    snapshot, points = network.snapshot, dense.points
+    there = {entry.block_id for entry in Ledger.of(snapshot).entries.values() if entry.status == "fused"}
+    degrees = points.redundancy
+    return {
+        "version": network.version,
+        "form": snapshot.metadata.form,
+        "points": len(points.ids),
+        "observations": int(sum(len(member.cluster) for member in dense.members)),
+        "blocks": sum(member.kind != "control" for member in dense.members),
+        "blocks_pending": len(there - set(points.blocks)),
+        "control_points": len(dense.control_points),
+        "tiles": 1,
+        "chi_square": points.chi_square,
+        "degrees_of_freedom": degrees,
+        "variance_factor": points.chi_square / degrees if degrees else float("nan"),
+        "ce90_median": float(np.median(dense.ce90())) if len(points.ids) else float("nan"),
+        "le90_median": float(np.median(dense.le90())) if len(points.ids) else float("nan"),
+        "tile_km": network.cover.core / 1000.0,
+        "frame": snapshot.metadata.frame,
+        "bytes": _size(snapshot.place),
+    }
+
+
+def _size(place: str) -> int:
+    """Bytes of a network in a folder; -1 where it is none."""
+    return sum(f.stat().st_size for f in Path(place).rglob("*") if f.is_file()) if "://" not in place else -1

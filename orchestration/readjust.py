@@ -18,6 +18,7 @@ from submin.storage.adjusted import AdjustedCameras, AdjustedWriter
 from submin.storage.arrays import group_of, read_record
 from submin.storage.catalogue import Catalogue
 from submin.storage.control_blocks import control_point_of
+from submin.storage.dense_reader import refuse_dense
 from submin.storage.ledger import Ledger
 from submin.storage.network import Network
 from submin.storage.point_table import RULE_0
@@ -75,6 +76,7 @@ def readjust_network(
         raise InputError(f"--deweight is {deweight:g}; expected 1 or more: the factor of the images' a priori sigmas")
     check_policy(policy)
     opened = Network(network, version)
+    refuse_dense(opened.snapshot, "readjustment")
     check_frames(catalogue, opened.snapshot)
     fused = {entry.block_id for entry in Ledger.of(opened.snapshot).fused()}
     asked = catalogue.block_ids if block is None else (catalogue.block(block).block_id,)

@@ -69,6 +69,8 @@ def query(
         "blocks": len(control.blocks), "seconds": seconds, "out": None if output is None else str(output),
         "validity": list(control.validity),
     }  # fmt: skip
+    if opened.dense is not None:
+        values |= {"chi_square": opened.dense.points.chi_square, "degrees_of_freedom": opened.dense.points.redundancy}
     if not len(control):
         show(values, as_json, f"{network} {control.version}: no determined points there")
         return
@@ -142,8 +144,11 @@ def map_command(
     """
     import submin
     from orchestration.network_map import draw_network
+    from submin.storage.dense_reader import refuse_dense
 
-    draw_network(submin.open(network), output)
+    opened = submin.open(network)
+    refuse_dense(opened.snapshot, "a map")
+    draw_network(opened, output)
     show({"out": str(output)}, as_json, f"map written to {output}")
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, counted, show
+
+if TYPE_CHECKING:
+    from submin.storage.catalogue import Catalogue
 
 LARGEST_INNOVATION = 1e-3
 """Blocks less improbable than that are not even doubtful."""
@@ -27,7 +30,7 @@ def create(
     ] = None,
     tile_km: Annotated[float | None, typer.Option("--tile-km", help="Side of a core; default 100, or 4 footprints with --fit.")] = None,
     overlap_km: Annotated[float | None, typer.Option("--overlap-km", help="Width that neighbours share, below the core's.")] = None,
-    form: Annotated[str, typer.Option("--form", help="Form of the sub-MINs.")] = "factored",
+    form: Annotated[str, typer.Option("--form", help="factored: images and points; dense: one tile of points alone.")] = "factored",
     frame: Annotated[str, typer.Option("--frame", help="Frame of the coordinates; with --fit the catalogue's.")] = "WGS84",
     epoch: Annotated[str, typer.Option("--epoch", help="Epoch of the frame; with --fit the catalogue's.")] = "",
     max_parameters: Annotated[
@@ -43,7 +46,7 @@ def create(
     Example: submin create network --bbox 97 33 103 37 --tile-km 100 --overlap-km 50
     """
     from orchestration.create import create as make
-    from orchestration.create import fit_catalogue, read_area
+    from orchestration.create import fit_catalogue, fit_points, read_area
     from submin.errors import InputError
     from submin.storage.catalogue import Catalogue
     from submin.storage.catalogue_schema import CatalogueMetadata
@@ -54,9 +57,13 @@ def create(
     metadata = CatalogueMetadata(name="network", frame=frame, epoch=epoch)
     if fit is not None:
         fitted = Catalogue.open(fit)
-        area, core, shared = fit_catalogue(fitted)
-        metadata, tile_km = fitted.metadata, core if tile_km is None else tile_km
-        overlap_km = min(shared, 0.5 * tile_km) if overlap_km is None else overlap_km
+        metadata = fitted.metadata
+        if form == "dense":
+            area = fit_catalogue(fitted)[0] if fitted.images else fit_points(fitted)
+        else:
+            area, core, shared = fit_catalogue(fitted)
+            tile_km = core if tile_km is None else tile_km
+            overlap_km = min(shared, 0.5 * tile_km) if overlap_km is None else overlap_km
     else:
         area = box_area(bbox) if bbox is not None else read_area(aoi)  # type: ignore[arg-type]
     made = make(network, area, metadata, tile_km, overlap_km, form, max_parameters, thin_metres)
@@ -89,6 +96,8 @@ def run(
     from orchestration.run import run as fuse
     from orchestration.stopping import resumable
     from submin.storage.catalogue import Catalogue
+    from submin.storage.dense_reader import is_dense
+    from submin.storage.network_store import Snapshot
 
     check_range("--workers", workers, 0, MOST_WORKERS)
     check_range("--batch-blocks", batch_blocks, 1)
@@ -97,6 +106,9 @@ def run(
 
         raise InputError(f"--innovation is {innovation:g}; expected 0 to {LARGEST_INNOVATION:g}")
     opened = Catalogue.open(catalogue)
+    if is_dense(Snapshot.open(network)):
+        _run_dense(opened, network, 1 if sequential else batch_blocks, as_json)
+        return
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter, innovation=innovation)
     lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
@@ -120,6 +132,30 @@ def run(
         raise typer.Exit(1)
 
 
+def _run_dense(catalogue: Catalogue, network: str, batch_blocks: int, as_json: bool) -> None:
+    """Run into a dense network: in this process, its update is one product of matrices."""
+    from orchestration.dense_run import run_dense
+    from orchestration.progress import progress_bars
+    from orchestration.stopping import resumable
+
+    with resumable(network), progress_bars(quiet=as_json) as reporter:
+        done = run_dense(catalogue, network, batch_blocks=batch_blocks, reporter=reporter)
+    counts = f"{done.control_fused} of control, {done.skipped} already there, {len(done.rejected)} rejected"
+    lines = [f"{network} {done.version}: {counted(done.fused, 'block')} fused, {counts}"]
+    if not (done.fused or done.control_fused or done.rejected):
+        lines[0] = f"{network} {done.version}: nothing is left to do, all {counted(done.skipped, 'block')} are in the network"
+    lines.append(f"{counted(done.points, 'point')}; chi-square {done.chi_square:.6g} with {done.degrees_of_freedom:,} degrees of freedom")
+    if done.pending:
+        few = ", ".join(done.pending[:5]) + ", ..." * (len(done.pending) > 5)
+        lines.append(f"{counted(len(done.pending), 'block')} waiting for points that are not determined yet: {few}")
+    lines += [f"doubtful: {', '.join(d.block_ids)}: d2 {d.d2:.1f} with {d.degrees_of_freedom} degrees of freedom (probability "
+              f"{d.probability:.2g}) against what was there; it was fused" for d in done.doubtful]  # fmt: skip
+    lines += [f"rejected block {r.block_id}: {r.reason}" for r in done.rejected]
+    show(done.to_json(), as_json, "\n".join(lines))
+    if done.rejected:
+        raise typer.Exit(1)
+
+
 @control_app.command("add")
 def control_add(
     network: Annotated[str, typer.Argument(help="Network that takes them.")],
@@ -133,14 +169,18 @@ def control_add(
     Example: submin control add network control.parquet
     """
     from orchestration.control import add_control
+    from orchestration.dense_run import add_dense_control
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
     from orchestration.stopping import resumable
+    from submin.storage.dense_reader import is_dense
+    from submin.storage.network_store import Snapshot
     from submin.storage.point_table import read_point_table
 
     table = read_point_table(points, "definite")
-    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
-        added = add_control(table, str(points), network, executor, reporter)
+    dense = is_dense(Snapshot.open(network))
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(0 if dense else workers, scheduler) as executor:
+        added = add_dense_control(table, network, reporter) if dense else add_control(table, str(points), network, executor, reporter)
     lines = [
         f"{network} {added.version}: {added.fused} control points added, {added.skipped} already there, {len(added.rejected)} rejected"
     ]
@@ -164,11 +204,19 @@ def withdraw(
 
     Example: submin withdraw network --image IMAGE_17
     """
+    from orchestration.dense_run import withdraw_dense
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
     from orchestration.stopping import resumable
     from orchestration.withdraw import withdraw as take
+    from submin.storage.dense_reader import is_dense
+    from submin.storage.network_store import Snapshot
 
+    if is_dense(Snapshot.open(network)):
+        with resumable(network):
+            left = withdraw_dense(network, block=block, image=image, control=control)
+        show(left.to_json(), as_json, f"{network} {left.version}: {left.what} withdrawn with {counted(left.rays, 'observation')}")
+        return
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         done = take(network, executor, block=block, image=image, control=control, reporter=reporter)
     show(done.to_json(), as_json, f"{network} {done.version}: {done.what} withdrawn with {done.rays:,} rays; "

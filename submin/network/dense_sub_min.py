@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from submin.errors import InputError, NumericalError
 from submin.network.observations import PointObservations
@@ -33,6 +34,11 @@ class Innovation:
 
     d2: float
     degrees_of_freedom: int
+
+    @property
+    def probability(self) -> float:
+        """Of a good block to agree as badly as this or worse; 1 for a block that brings nothing but new points."""
+        return float(chi2.sf(self.d2, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def common_points(
     if tile is None:
         return None
     held = set(source.cover.cells_held(tile))
-    kept, parts = determined_parts(source, well_spread([s for s in selections if s.cell.number in held], MOST_POINTS))
+    kept, parts = determined_parts(source, well_spread(source, [s for s in selections if s.cell.number in held], MOST_POINTS))
     if not parts:
         return None
     mates = mates_in(tile) if any(_shares(prior) for prior in block.priors) else np.empty(0, dtype=np.int32)

@@ -58,6 +58,11 @@ def accuracy_of_all(network: Network, on: date | None = None) -> PointAccuracy:
 
     Points whose rays determine no position are left out. Memory is that of one tile's sub-MIN and of its own points.
     """
+    if network.dense is not None:
+        dense, tile = network.dense, network.cover.tile_name(0)
+        ids, none = dense.points.ids, np.zeros(len(dense.points.ids), dtype=np.bool_)
+        tiles = np.full(len(ids), tile)
+        return PointAccuracy(ids, dense.geodetic, dense.ce90(), dense.le90(), tiles, dense.observation_counts, none, none)
     day = today() if on is None else on
     return _joined([_of_tile(network, tile, day) for tile in network.snapshot.tile_numbers()])
 

@@ -43,6 +43,7 @@ from submin.storage.block_images import network_images
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
+from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
 from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
@@ -79,6 +80,7 @@ class Network:
         self._images: dict[int, NetworkImage] = {}
         self._numbers: tuple[int, ...] | None = None
         self._tiles: frozenset[int] | None = None
+        self._dense = DenseReader(self._snapshot) if is_dense(self._snapshot) else None
 
     @property
     def version(self) -> str:
@@ -89,6 +91,11 @@ class Network:
     def snapshot(self) -> Snapshot:
         """The version in the store."""
         return self._snapshot
+
+    @property
+    def dense(self) -> DenseReader | None:
+        """What only a dense network has; None for a factored one."""
+        return self._dense
 
     def at(self, version: str) -> Network:
         """The same network at another version.
@@ -131,6 +138,8 @@ class Network:
         QueryError
             When nothing or too much is asked, a policy, tile or point is unknown, a box is not one, or ``max_points`` is below 1.
         """
+        if self._dense is not None:
+            return self._query_dense(self._dense, bbox, area, points, tile, policy, max_points)
         selections, number = self._selected(bbox, area, points, tile, max_points, today() if on is None else on)
         return self.control_set(answer(self, selections, policy, number))
 
@@ -170,6 +179,11 @@ class Network:
         """
         check_suffix(path)
         check_asked(family, rank, floor)
+        if self._dense is not None:
+            everything = self.cover.tile_name(0) if bbox is None and area is None and tile is None else tile
+            control = self._query_dense(self._dense, bbox, area, None, everything, policy, max_points)
+            check_size(len(control))
+            return write_compact(path, control, control.compact(family, rank, floor))
         if bbox is None and area is None and tile is None:
             selections, number = self._reported(all_points(self), today()), None
             if max_points is not None:
@@ -185,9 +199,7 @@ class Network:
         tile: str | None, max_points: int | None, on: date,
     ) -> tuple[list[Selection], int | None]:  # fmt: skip
         """Points that are asked for, and the number of the tile that is named."""
-        asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
-        if len(asked) > 1 or (not asked and tile is None):
-            raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
+        _check_asked(bbox, area, points, tile)
         number = None if tile is None else self.cover.tile_number(tile)
         if bbox is not None:
             area = box_area(bbox)
@@ -236,6 +248,7 @@ class Network:
         QueryError
             When nothing or too much is asked, a tile or point is unknown, or a box is not one.
         """
+        refuse_dense(self._snapshot, "metadata of points")
         asked = [n for n, value in (("bbox", bbox), ("area", area), ("points", points), ("tile", tile)) if value is not None]
         if len(asked) != 1:
             raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, tile")
@@ -264,6 +277,7 @@ class Network:
         QueryError
             When the network does not have one of them.
         """
+        refuse_dense(self._snapshot, "what is known of single points")
         ids = np.unique(np.asarray(points, dtype=np.str_))
         selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids), every=True)
         if len(missing):
@@ -290,9 +304,31 @@ class Network:
             kept.append(Selection(s.cell, s.rows[reported[s.rows]]))
         return [s for s in kept if len(s.rows)]
 
+    def _query_dense(
+        self, dense: DenseReader, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None,
+        points: Sequence[str] | NDArray[np.str_] | None, tile: str | None, policy: str, most: int | None,
+    ) -> ControlSet:  # fmt: skip
+        """Answer of a dense network; its one tile holds every point."""
+        _check_asked(bbox, area, points, tile)
+        if tile is not None:
+            self.cover.tile_number(tile)  # an unknown one is refused
+        area = area if bbox is None else box_area(bbox)
+        if area is not None:
+            rows = dense.in_area(area)
+            if not len(rows) and _inside_when_swapped(area, self.cover):
+                raise QueryError(
+                    "the area queried is outside the network, and inside it with its axes swapped; expected longitude first, then latitude"
+                )
+        else:
+            rows = np.arange(len(dense.points.ids)) if points is None else dense.named(points)
+        return dense.answer(rows, policy, most)
+
     def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
         """Those of some points that the network can answer for, by their cell."""
         ids = np.unique(np.asarray(points, dtype=np.str_))
+        if self._dense is not None:
+            held = self._dense.held(ids)
+            return {0: held} if len(held) else {}
         selections, _ = points_named(self, ids, self._snapshot.candidate_cells(ids))
         return {s.cell.number: s.cell.point_ids[s.rows] for s in selections}
 
@@ -315,6 +351,7 @@ class Network:
         QueryError
             When a tile does not hold a point, or a point is not determined.
         """
+        refuse_dense(self._snapshot, "a covariance between tiles")
         tiles = self.cover.tile_number(one), self.cover.tile_number(other)
         found = [self._parts_of_tile(tile, np.asarray(ids, dtype=np.str_)) for tile, ids in zip(tiles, (ids_one, ids_other), strict=True)]
         (names, parts, places), (names_other, parts_other, places_other) = found
@@ -491,6 +528,13 @@ class TilePreview:
             if len(missing):
                 raise QueryError(f"{len(missing)} of {len(wanted)} points are not determined in the tile, {missing[0]} among them")
         return self._network.control_set(answer(self._source, selections, "tile", self._source.tile))
+
+
+def _check_asked(bbox: object, area: object, points: object, tile: str | None) -> None:
+    """Refuse a query by nothing, or by more than one of box, area and points."""
+    asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
+    if len(asked) > 1 or (not asked and tile is None):
+        raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
 
 
 def box_area(bbox: tuple[float, float, float, float]) -> BaseGeometry:

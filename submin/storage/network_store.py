@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -85,8 +85,8 @@ def _reason(error: Exception) -> str:
     return next((line for line in reversed(lines) if line), type(error).__name__)
 
 
-def create_network(place: str, metadata: NetworkMetadata) -> Version:
-    """Create an empty network, its version 0.
+def create_network(place: str, metadata: NetworkMetadata, begin: Callable[[zarr.Group], None] | None = None) -> Version:
+    """Create an empty network, its version 0; ``begin`` writes what its form has besides.
 
     Raises
     ------
@@ -110,6 +110,8 @@ def create_network(place: str, metadata: NetworkMetadata) -> Version:
         create_table(root, "ledger", LEDGER_COLUMNS)
         create_table(root, "directory", DIRECTORY_COLUMNS)
         create_table(root, "flags", FLAG_COLUMNS)
+        if begin is not None:
+            begin(root)
         session.commit("created", metadata={"version": 0})
         if folder.is_dir():
             for part in sorted(Path(making).iterdir(), key=lambda path: path.name == "refs"):  # which make it a repository

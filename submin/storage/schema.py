@@ -48,7 +48,7 @@ class NetworkMetadata:
     name, body, frame, epoch : texts; heights are ellipsoidal
     semimajor_axis, flattening : ellipsoid (metres)
     cover : description of the cover, see `Cover.to_mapping`
-    form : ``factored``
+    form : ``factored`` or ``dense`` (decision 011)
     parameters : adjustable parameters kept for each image; later versions may keep more, when a sensor comes that has them
     max_parameters : a tile that would hold more image parameters is split, where its overlap lets it
     format_version : of the store

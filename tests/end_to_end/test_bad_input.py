@@ -42,6 +42,7 @@ from orchestration.run import run
 from submin.adjustment.warm_up import compile_kernels
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
+from submin.storage.catalogue_schema import CatalogueMetadata
 from submin.storage.network_store import Snapshot, tag_version, versions
 from submin.storage.point_table import read_point_table
 from submin.storage.rpc_import import import_rpc
@@ -123,6 +124,12 @@ class World:
         path = self.write("survey.csv", f"{','.join(POINT | SIGMAS)}\nP00000,100,35,900,9000,9000,9000\n")
         add_control(read_point_table(path), "survey", str(self.fused), SerialExecutor())
         return path
+
+    def dense(self) -> Path:
+        """An empty network of the dense form."""
+        place = self.folder / "dense"
+        create(str(place), shapely.box(*BOX[1:]), CatalogueMetadata("dense"), None, None, "dense")
+        return place
 
     @property
     def new(self) -> Path:
@@ -289,7 +296,11 @@ simply("network made where something is", lambda w: ["create", w.network, *BOX])
 simply("network made where a file is", lambda w: ["create", w.write("file", "mine"), *BOX])
 simply("network made below a file", lambda w: ["create", w.write("file", "mine") / "network", *BOX])
 simply("unknown version", lambda w: ["query", w.fused, *BOX, "--at", "v7"])
-simply("unknown form", lambda w: ["create", w.new, *BOX, "--form", "dense"])
+simply("unknown form", lambda w: ["create", w.new, *BOX, "--form", "sparse"])
+simply("sizes of tiles for a dense network", lambda w: ["create", w.new, *BOX, "--form", "dense", "--tile-km", "50"])
+simply("map of a dense network", lambda w: ["map", w.dense(), "--out", w.folder / "map.png"])
+simply("policy of several tiles for a dense network", lambda w: ["query", w.dense(), *BOX, "--policy", "rigorous"])
+simply("image withdrawn from a dense network", lambda w: ["withdraw", w.dense(), "--image", "IMAGE"])
 
 
 @case("network of another format version")

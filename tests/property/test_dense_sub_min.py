@@ -9,6 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dense_networks import (
+    assert_equal,
+    heights,
+    mixed_cluster,
+    position_cluster,
+    regular,
+    simultaneous,
+    truth,
+    victoria,
+)
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -21,16 +31,6 @@ from submin.network.observations import Cluster, PointObservations, Stack
 from submin.network.pending import DenseNetwork, fusable
 from submin.network.sub_min import GroundPart, SubMin, factor, joint_covariance, loadings, locate
 from submin.network.triangle import Triangle
-from tests.property.dense_networks import (
-    assert_equal,
-    heights,
-    mixed_cluster,
-    position_cluster,
-    regular,
-    simultaneous,
-    truth,
-    victoria,
-)
 from tests.property.test_sub_min import P, image_set
 
 Array = NDArray[np.float64]

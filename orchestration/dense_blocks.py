@@ -1,0 +1,109 @@
+"""What comes to a dense network as sets of observations: clusters of a catalogue, control points, blocks of images by their points."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestration.batch import block_rays, disagreement
+from orchestration.tasks import adjust_block
+from submin.adjustment.adjustment import adjust
+from submin.adjustment.elimination import eliminate, linearise, point_factors
+from submin.adjustment.estimation import estimate_images
+from submin.adjustment.intersection import intersect
+from submin.adjustment.rays import Rays
+from submin.errors import InputError, NumericalError
+from submin.geodesy import Ellipsoid, geodetic_to_geocentric, local_axes
+from submin.network.network_image import image_set
+from submin.network.observations import Cluster
+from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate
+from submin.query.planner import DETERMINED_METRES
+from submin.sensors import sensor_named, width_of
+from submin.storage.catalogue_schema import Block, PointTable
+from submin.storage.control_blocks import control_block_id
+from submin.storage.dense_store import Member
+
+Array = NDArray[np.float64]
+
+
+def control_members(points: PointTable, ellipsoid: Ellipsoid) -> Iterator[Member]:
+    """Control points as positions: one set each, or one of all where they have a joint covariance."""
+    geocentric, axes = geodetic_to_geocentric(points.geodetic, ellipsoid), local_axes(points.geodetic)
+    if points.joint_covariance is not None:
+        ids = points.point_ids
+        name = control_block_id(str(np.sort(ids)[0])) + (f" and {len(ids) - 1} more" if len(ids) > 1 else "")
+        stated = json.dumps([ids.tolist(), points.geodetic.tolist(), points.joint_covariance.tolist()])
+        yield Member(positions(name, ids, geocentric, points.joint_covariance), "control", stated=stated)
+        return
+    for k, point in enumerate(points.point_ids.tolist()):
+        covariance = axes[k].T @ points.covariance_enu[k] @ axes[k]
+        # as surveyed: rotated numbers differ in their last digits from one machine to another
+        stated = json.dumps([point, points.geodetic[k].tolist(), points.covariance_enu[k].tolist()])
+        cluster = positions(control_block_id(point), points.point_ids[k : k + 1], geocentric[k : k + 1], 0.5 * (covariance + covariance.T))
+        yield Member(cluster, "control", stated=stated)
+
+
+def positions(name: str, ids: NDArray[np.str_], geocentric: Array, covariance: Array) -> Cluster:
+    """A cluster of positions alone."""
+    return Cluster(name, ids, np.full(len(ids), "", dtype="U1"), geocentric, covariance)
+
+
+def free_points(block: Block, ellipsoid: Ellipsoid) -> Member:
+    """The points of a block of images, adjusted by itself, with their joint covariance.
+
+    Images are marginalised: what the dense network keeps of the block are its determined points.
+
+    Raises
+    ------
+    InputError
+        With the reason for which the block cannot come in.
+    """
+    raw = block_rays(block)
+    outcome = adjust_block(raw, ellipsoid)
+    reason = outcome.reason or disagreement(outcome.accepted)
+    if reason is not None:
+        raise InputError(reason)
+    images = image_set(raw.images, ellipsoid, width_of(image.sensor for image in raw.images))
+    used = outcome.accepted
+    ids, point = np.unique(raw.point_ids[used], return_inverse=True)
+    order = np.lexsort((raw.observed[used][:, 1], raw.observed[used][:, 0], raw.image[used], point))
+    rays = Rays(
+        point[order].astype(np.int32), raw.image[used][order], raw.observed[used][order], raw.sigma[used][order],
+        np.ones(len(order), dtype=np.bool_),
+    )  # fmt: skip
+    solved = adjust(images, rays, intersect(images, rays, len(ids)))
+    if not solved.converged:
+        raise InputError(solved.status.message(images.ids, ids))
+    images = images.release(solved.released)
+    linear = linearise(images, rays, solved.theta, solved.ground, solved.ground)
+    weight = solved.accepted.astype(np.float64)
+    sums, part = eliminate(linear, weight, len(images)), GroundPart(solved.ground, linear, point_factors(linear, weight))
+    estimate = estimate_images(sums, images.prior, images.parameters)
+    rows = np.arange(len(images), dtype=np.int32)
+    state = SubMin(rows, estimate.theta, estimate.covariance, estimate.chi_square, sums.redundancy)
+    determined = (part.factors.rank == 3) & (np.bincount(rays.point[solved.accepted], minlength=len(ids)) >= 2)
+    own = np.where(determined[:, None, None], part.factors.own, 0.0)
+    determined &= np.trace(own, axis1=1, axis2=2) < DETERMINED_METRES**2
+    if not determined.any():
+        raise InputError("none of its points is determined; expected points measured in two images or more")
+    kept = np.flatnonzero(determined)
+    loading = loadings([part], rows, images.parameters)[(3 * kept[:, None] + np.arange(3)).ravel()]
+    try:
+        covariance = joint_covariance(loading, own[kept], estimate.covariance)
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise NumericalError("the covariance of its points is not positive definite; check its rays and its a priori model") from None
+    passes = sorted({image.pass_id for image in block.images if shares_errors(block, image.sensor)})
+    cluster = positions(block.block_id, ids[kept], locate(part, state)[kept], covariance)
+    return Member(cluster, "images", tuple(passes), estimate.chi_square, sums.redundancy)
+
+
+def shares_errors(block: Block, sensor: str) -> bool:
+    """True when images of a sensor have errors in common with others of their pass."""
+    if block.a_priori is None:
+        return False
+    stated = [block.a_priori.of(parameter) for parameter in sensor_named(sensor).parameters]
+    return any(s.common_to_pass > 0.0 and s.sigma > 0.0 for s in stated)
