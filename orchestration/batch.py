@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,14 @@ from orchestration.change import Move, finish, place, settle, take_points
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
 from orchestration.tasks import BlockRays, FlaggedImage, adjust_blocks
+from submin.adjustment.joint_errors import JointErrors
+from submin.adjustment.priors import JointRows
+from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.geodesy import geocentric_to_geodetic
-from submin.network.network_image import NetworkImage
+from submin.network.network_image import JointPlace, NetworkImage
 from submin.network.registration import LooseRays, together
 from submin.storage.catalogue_schema import Block
-from submin.storage.control_blocks import control_point_of
+from submin.storage.control_blocks import points_of
 from submin.storage.ledger import Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 
@@ -28,10 +31,17 @@ LEAST_AGREEING = 0.5
 
 @dataclass(frozen=True)
 class Rejected:
-    """A block that was not fused, and why."""
+    """A block that was not fused, and why; ``points`` are those of a block of surveyed ones."""
 
     block_id: str
     reason: str
+    kind: str = "images"
+    points: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, block: Block, reason: str) -> Rejected:
+        """The rejection of a block."""
+        return cls(block.block_id, reason, block.kind, points_of(block))
 
 
 @dataclass(frozen=True)
@@ -41,15 +51,17 @@ class BatchResult:
     Attributes
     ----------
     version : number of the committed version
-    fused : ids of the fused blocks; rejected : the others
+    fused : the fused blocks; rejected : the others
     flagged : images whose camera the judged tiles find bad
+    contradicted : surveyed points that contradict the network, by judged tile
     tiles : that were judged; unsettled : tiles whose judgement did not come to rest (their rays are used as last judged)
     """
 
     version: int
-    fused: tuple[str, ...]
+    fused: tuple[Block, ...]
     rejected: tuple[Rejected, ...]
     flagged: tuple[FlaggedImage, ...]
+    contradicted: dict[int, tuple[ContradictedPoint, ...]]
     tiles: tuple[int, ...]
     unsettled: tuple[int, ...]
 
@@ -71,21 +83,21 @@ def fuse_batch(
     ledger = Ledger.of(base)
     unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
     if not blocks and not unsaid:
-        return BatchResult(base.number, (), tuple(refused), (), (), ())  # the same command again writes nothing
+        return BatchResult(base.number, (), tuple(refused), (), {}, (), ())  # the same command again writes nothing
     settled = settle(session, base, move, executor, reporter)
     version += 1
     lost = settled.rejected[base.image_count() :]
     of_block = np.repeat(np.arange(len(blocks)), [len(block.images) for block in blocks])
     rejected_rays = np.bincount(of_block, weights=lost, minlength=len(blocks)).astype(np.int64).tolist()
     entries = [
-        Entry(b.block_id, b.content_hash(), "fused", "", version, len(b.images), len(b), n)
+        Entry(b.block_id, b.content_hash(), "fused", "", version, len(b.images), len(b), n, b.kind)
         for b, n in zip(blocks, rejected_rays, strict=True)
     ]  # fmt: skip
-    entries += [Entry(r.block_id, "", "rejected", r.reason, version) for r in unsaid]
+    entries += [Entry(r.block_id, "", "rejected", r.reason, version, kind=r.kind) for r in unsaid]
     records = [image for block in blocks for image in block.images]
     finish(session, base, move, settled, records, entries, f"{len(blocks)} blocks fused, {len(refused)} rejected")
     return BatchResult(
-        version, tuple(block.block_id for block in blocks), tuple(refused), settled.flagged,
+        version, tuple(blocks), tuple(refused), settled.flagged, settled.contradicted,
         tuple(r.tile for r in settled.reports), tuple(r.tile for r in settled.reports if not r.converged),
     )  # fmt: skip
 
@@ -93,12 +105,12 @@ def fuse_batch(
 def _stage_one(
     blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of control points."""
-    of_images = [block for block in blocks if control_point_of(block.block_id) is None]
+    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of surveyed points."""
+    of_images = [block for block in blocks if block.kind == "images"]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
     arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid) for group in groups]
     handles = executor.submit_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
-    accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if control_point_of(b.block_id) is not None}
+    accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if b.kind != "images"}
     for outcome in (outcome for group in executor.results(handles) for outcome in group):
         reason = outcome.reason or disagreement(outcome.accepted)
         if reason is None:
@@ -130,7 +142,7 @@ def _register(
         bad = _misplaced(blocks, rays, move)
         if not bad:
             return blocks, move
-        refused.extend(Rejected(blocks[k].block_id, bad[k]) for k in sorted(bad))
+        refused.extend(Rejected.of(blocks[k], bad[k]) for k in sorted(bad))
         blocks = [block for k, block in enumerate(blocks) if k not in bad]
 
 
@@ -168,9 +180,20 @@ def _inside_when_swapped(ids: NDArray[np.str_], move: Move) -> bool:
 def network_images(block: Block) -> tuple[NetworkImage, ...]:
     """The images of a block of a catalogue as a network has them."""
     a_priori = "" if block.a_priori is None else json.dumps(block.a_priori.to_mapping(), sort_keys=True)
-    return tuple(
+    images = tuple(
         NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, a_priori) for i in block.images
     )
+    return images if block.joint is None else _joined(images, block.joint, block.content_hash())
+
+
+def _joined(images: Sequence[NetworkImage], joint: JointErrors, record: str) -> tuple[NetworkImage, ...]:
+    """Views of correlated points with their rows of the common factor: two of a point's first view, the third of the other."""
+    joined = []
+    for k, image in enumerate(images):
+        place = JointPlace(record, 3 * (k // 2) + 2 * (k % 2), 2 - k % 2, joint.part)
+        rows = joint.factor[place.first : place.first + place.rows]
+        joined.append(replace(image, a_priori=place.to_text(), joint=JointRows(rows, joint.part)))
+    return tuple(joined)
 
 
 def block_rays(block: Block) -> BlockRays:

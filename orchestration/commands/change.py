@@ -93,6 +93,7 @@ def run(
     if not result.fused and not result.rejected:
         lines[0] = f"{network} {result.version}: nothing is left to do, all {result.skipped} blocks are in the network"
     lines += [f"bad camera {f.image_id}: {f.reason}" for f in result.flagged]
+    lines += [f"not used: {c.reason}" for c in result.contradicted]
     lines += [f"rejected block {r.block_id}: {r.reason}" for r in result.rejected]
     lines += [f"tile {t}: the judgement of its rays did not settle; they are used as last judged" for t in result.unsettled_tiles]
     show(result.to_json(), as_json, "\n".join(lines))
@@ -103,7 +104,7 @@ def run(
 @control_app.command("add")
 def control_add(
     network: Annotated[str, typer.Argument(help="Network that takes them.")],
-    points: Annotated[Path, typer.Argument(help="Table of surveyed points with their covariance or sigmas.")],
+    points: Annotated[Path, typer.Argument(help="Table of surveyed points with their covariance or sigmas, or a joint covariance.")],
     workers: Workers = 0,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -125,8 +126,9 @@ def control_add(
         f"{network} {added.version}: {added.fused} control points added, {added.skipped} already there, {len(added.rejected)} rejected"
     ]
     lines += [f"rejected {r.point_id}: {r.reason}" for r in added.rejected]
+    lines += [f"not used: {c.reason}" for c in added.contradicted]
     show(added.to_json(), as_json, "\n".join(lines))
-    if added.rejected:
+    if added.rejected or added.contradicted:
         raise typer.Exit(1)
 
 
@@ -135,7 +137,7 @@ def withdraw(
     network: Annotated[str, typer.Argument(help="Network to withdraw from.")],
     block: Annotated[str | None, typer.Option("--block", help="Id of a block, with all its images.")] = None,
     image: Annotated[str | None, typer.Option("--image", help="Id of one image; the rest of its block stays.")] = None,
-    control: Annotated[str | None, typer.Option("--control", help="Id of a control point.")] = None,
+    control: Annotated[str | None, typer.Option("--control", help="Id of a control point; correlated ones leave together.")] = None,
     workers: Workers = 0,
     scheduler: Scheduler = None,
     as_json: Json = False,

@@ -49,11 +49,19 @@ class ImageEstimate:
         inverse, info = la.lapack.dpotri(self.factor, lower=1)
         if info != 0:
             raise NumericalError(f"the information matrix ({len(self.factor)} parameters) cannot be inverted")
-        return np.asarray(self.prior @ (self.prior @ fill_symmetric(np.asarray(inverse))).T)
+        rows, factor = adjustable_part(self.prior)
+        covariance = np.asarray(factor @ (factor @ fill_symmetric(np.asarray(inverse))).T)
+        if len(rows) == self.prior.shape[0]:
+            return covariance
+        whole = np.zeros((self.prior.shape[0], self.prior.shape[0]))
+        whole[np.ix_(rows, rows)] = covariance
+        return whole
 
 
 DENSE_SIZE = 200
 """Up to so many parameters a dense product with the a priori factor costs less than looking up its few entries."""
+DENSE_PART = 0.05
+"""So does it where so large a part of the entries is not zero: correlated control, whose shifts all depend on one another."""
 MIRROR_BLOCK = 256
 
 
@@ -68,16 +76,27 @@ def fill_symmetric(lower: Array) -> Array:
     return lower
 
 
+def adjustable_part(prior: sp.csr_array) -> tuple[NDArray[np.int64], sp.csr_array | Array]:
+    """Rows of an a priori factor K that are not zero, and these of K, dense where that costs less.
+
+    The others are padding: parameters that an image's sensor does not have, or that are held.
+    """
+    rows = np.flatnonzero(np.diff(prior.indptr))
+    factor = prior if len(rows) == prior.shape[0] else prior[rows]
+    dense = len(rows) <= DENSE_SIZE or factor.nnz > DENSE_PART * factor.shape[0] * factor.shape[1]
+    return rows, factor.toarray() if dense else factor
+
+
 def reduced_information(information: Array, prior: sp.csr_array) -> Array:
     """``I + K' S K`` (q, q), for summed information S (lower triangle) and a priori factor K."""
-    full = fill_symmetric(information.copy())
-    if len(full) <= DENSE_SIZE:
-        dense = prior.toarray()
-        total = dense.T @ (full @ dense)
+    rows, factor = adjustable_part(prior)
+    full = fill_symmetric(information.copy() if len(rows) == len(information) else information[np.ix_(rows, rows)])
+    if isinstance(factor, np.ndarray):
+        total = factor.T @ (full @ factor)
         total[np.diag_indices(len(total))] += 1.0
         return np.asarray(total)
-    half = prior.T @ full
-    total = np.asarray((prior.T @ np.ascontiguousarray(half.T)).T)
+    half = factor.T @ full
+    total = np.asarray((factor.T @ np.ascontiguousarray(half.T)).T)
     total[np.diag_indices(len(total))] += 1.0
     return total
 

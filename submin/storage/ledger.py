@@ -11,9 +11,11 @@ import zarr
 
 from submin.storage.arrays import append_table
 from submin.storage.catalogue_schema import Block, defects
-from submin.storage.control_blocks import control_point_of
+from submin.storage.control_blocks import point_of_view, points_of
 from submin.storage.network_store import Snapshot
 
+VIEWS = 2
+"""Images that a surveyed point has."""
 _MEASURED = re.compile(r"\d+\.\d+")
 
 
@@ -23,12 +25,13 @@ class Entry:
 
     Attributes
     ----------
-    block_id : the block; ``control:ID`` for a control point
+    block_id : the block; ``control:ID`` for a control point, ``control:set:...`` for a set of correlated ones
     content : hash of what came, see `Block.content_hash`; empty for a rejected block
     status : ``fused``, ``rejected`` or ``withdrawn``
     reason : why it was rejected, or which images are withdrawn from it
     version : that the line came with
     images, rays, rays_rejected : what the network has of the block
+    kind : of the block, one of `BLOCK_KINDS`
     """
 
     block_id: str
@@ -39,6 +42,7 @@ class Entry:
     images: int = 0
     rays: int = 0
     rays_rejected: int = 0
+    kind: str = "images"
 
 
 def append_entries(ledger: zarr.Group, entries: Sequence[Entry]) -> None:
@@ -88,14 +92,18 @@ class Ledger:
 
     def refusal(self, block: Block) -> str | None:
         """Why a block that is not the same as before cannot come in, or None."""
-        control = control_point_of(block.block_id)
         if block.block_id in self._content:
-            if control is not None:
-                return (
-                    f"control point {control} is already in the network with other values; withdraw it first ('submin withdraw --control')"
-                )
+            if block.kind == "control":
+                what = f"control point {block.point_ids[0]}" if block.joint is None else f"set of {len(points_of(block))} control points"
+                return f"{what} is already in the network with other values; withdraw it first ('submin withdraw --control')"
             return f"block {block.block_id} is already in the network with other content; withdraw it first, or give the new one another id"
         for image in block.images:
+            point = point_of_view(image.image_id)
+            if image.image_id in self.block_of_image and point is not None:
+                return (
+                    f"point {point} is control of the network already, in block {self.block_of_image[image.image_id]}; "
+                    f"a survey counts once; withdraw that first ('submin withdraw --control {point}')"
+                )
             if image.image_id in self.block_of_image:
                 return f"image {image.image_id} already came in block {self.block_of_image[image.image_id]}; an image counts once"
         return defects(block)
@@ -111,9 +119,12 @@ class Ledger:
 
     def fused(self) -> tuple[Entry, ...]:
         """Blocks of images that are in the network."""
-        return tuple(e for e in self.entries.values() if e.status == "fused" and control_point_of(e.block_id) is None)
+        return tuple(e for e in self.entries.values() if e.status == "fused" and e.kind == "images")
 
     def control_points(self) -> tuple[str, ...]:
-        """Ids of the control points that are in the network."""
-        found = (control_point_of(e.block_id) for e in self.entries.values() if e.status == "fused")
-        return tuple(sorted(point for point in found if point is not None))
+        """Ids of the control points that are in the network, those of sets and of observed positions among them."""
+        return tuple(sorted({point for image in self.block_of_image if (point := point_of_view(image)) is not None}))
+
+    def control_sets(self) -> tuple[str, ...]:
+        """Blocks of points with a joint covariance that are in the network."""
+        return tuple(e.block_id for e in self.entries.values() if e.status == "fused" and e.kind != "images" and e.images > VIEWS)
