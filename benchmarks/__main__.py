@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import faults, five_blocks, main_job, stage_one, worldview
+from benchmarks import dense_update, faults, five_blocks, main_job, stage_one, worldview
 from benchmarks.comparison import DATA, MET
 from benchmarks.machine import machine
 from orchestration.text_tables import as_wide_as
@@ -21,6 +21,7 @@ from orchestration.text_tables import as_wide_as
 BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "main-job": ("the rate of every station from rays to a committed network", main_job.measure),
     "stage-1": ("projection, and a triplet through stage 1: fast, and linear in rays", stage_one.measure),
+    "dense-update": ("a dense network's update in the time of BLAS's own; a thousand updates lose no digits", dense_update.measure),
     "faults": ("a run whose processes are killed leaves the network of an undisturbed one", faults.measure),
     "five-blocks": ("Tables 2 and 3 of the 2008 paper; sequential = simultaneous; consistent", five_blocks.measure),
     "worldview": ("Tables 3 to 6 of the 2010 paper; pair = cell = simultaneous; time a pair", worldview.measure),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
 from orchestration.change import Move, finish, place, settle, take_points
@@ -20,6 +21,7 @@ from submin.geodesy import geocentric_to_geodetic
 from submin.network.network_image import JointPlace, NetworkImage
 from submin.network.registration import LooseRays, together
 from submin.storage.catalogue_schema import Block
+from submin.storage.check_points import enter_check_points
 from submin.storage.control_blocks import points_of
 from submin.storage.ledger import Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
@@ -67,9 +69,12 @@ class BatchResult:
 
 
 def fuse_batch(
-    where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter
-) -> BatchResult:
+    where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter,
+    check_points: NDArray[np.str_] | None = None,
+) -> BatchResult:  # fmt: skip
     """Fuse blocks that the ledger of a version has let through; ``rejected`` ones are entered in the ledger in the same commit.
+
+    So are the ids of ``check_points``, where blocks are fused.
 
     Raises
     ------
@@ -94,6 +99,8 @@ def fuse_batch(
         for b, n in zip(blocks, rejected_rays, strict=True)
     ]  # fmt: skip
     entries += [Entry(r.block_id, "", "rejected", r.reason, version, kind=r.kind) for r in unsaid]
+    if blocks and check_points is not None:
+        enter_check_points(zarr.open_group(session.store, mode="r+"), base, check_points)
     records = [image for block in blocks for image in block.images]
     finish(session, base, move, settled, records, entries, f"{len(blocks)} blocks fused, {len(refused)} rejected")
     return BatchResult(

@@ -205,7 +205,7 @@ def _dissolve(base: Snapshot, cover: Cover, out: TakenOut) -> TakenOut:
 
 def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Executor, reporter: Reporter) -> Settled:
     """Update and factor every tile that a move touches, and write cells and tiles into the session."""
-    cover = replace(move.cover)  # without what it has worked out so far: it travels with every task
+    cover = replace(move.cover, area=b"")  # without the area and what it has worked out so far: it travels with every task
     arrivals, departures = move.registration.arrivals, move.out.departures
     tiles = _touched_tiles(cover, move.out, move.registration)
     shared = executor.share(list(move.images))

@@ -13,7 +13,7 @@ from typing import NoReturn
 import typer
 from rich.console import Console
 
-from orchestration.commands import ask, cameras, change, imports, simulate
+from orchestration.commands import ask, cameras, change, export, health, imports, points, simulate
 from orchestration.stopping import Stopped, signals_stop
 
 app = typer.Typer(
@@ -22,7 +22,7 @@ app = typer.Typer(
 )  # fmt: skip
 app.add_typer(imports.app, name="import")
 app.add_typer(simulate.app, name="simulate")
-for module in (change, cameras, ask):
+for module in (change, cameras, ask, points, export, health):
     app.add_typer(module.app)
 
 USAGE_ERROR: type[typer.BadParameter] = typer.BadParameter.__mro__[1]

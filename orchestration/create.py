@@ -13,13 +13,14 @@ from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
 from submin.formats.columns import required_path
-from submin.geodesy import Ellipsoid
-from submin.sensors import sensor_named, width_of
-from submin.storage.catalogue import Catalogue, read_footprint
-from submin.storage.catalogue_schema import CatalogueMetadata, ImageRecord
+from submin.sensors import width_of
+from submin.storage.catalogue import Catalogue
+from submin.storage.catalogue_schema import CatalogueMetadata
+from submin.storage.image_footprints import image_footprints
 from submin.storage.network_store import create_network
 from submin.storage.schema import NetworkMetadata
 from submin.tiling.cover import Cover, check_on_globe, cover_area
+from submin.tiling.footprints import footprint_widths, on_globe
 
 DEFAULT_CORE_KM = 100.0
 CORE_IN_FOOTPRINTS = 4.0
@@ -39,6 +40,7 @@ class Created:
         return {
             "network": self.place, "tiles": self.cover.tile_count, "rows": self.cover.rows, "columns": self.cover.columns,
             "tile_km": self.cover.core / 1000.0, "overlap_km": self.cover.overlap / 1000.0, "frame": self.metadata.frame, "version": "v0",
+            "thin_metres": self.metadata.thinning,
         }  # fmt: skip
 
 
@@ -50,8 +52,11 @@ def create(
     overlap_km: float | None,
     form: str = "factored",
     max_parameters: int = 2500,
+    thin_metres: float | None = None,
 ) -> Created:
     """Create an empty network over an area (longitude and latitude, degrees).
+
+    ``thin_metres``: it reports one point in each square of this side; all points without one (decision 013).
 
     Raises
     ------
@@ -62,13 +67,15 @@ def create(
     """
     if form != "factored":
         raise InputError(f"form is {form!r}; this release makes 'factored' networks")
+    if thin_metres is not None and not (np.isfinite(thin_metres) and thin_metres > 0.0):
+        raise InputError(f"--thin-metres is {thin_metres:g}; expected a positive length, or none of this option to report every point")
     core = 1000.0 * (DEFAULT_CORE_KM if tile_km is None else tile_km)
     overlap = 0.25 * core if overlap_km is None else 1000.0 * overlap_km
     cover = cover_area(area, core, overlap, metadata.ellipsoid)
     network = NetworkMetadata(
         name=Path(place).name, body=metadata.body, frame=metadata.frame, epoch=metadata.epoch,
         semimajor_axis=metadata.semimajor_axis, flattening=metadata.flattening, cover=cover.to_mapping(), form=form,
-        parameters=width_of(["rpc"]), max_parameters=max_parameters,
+        parameters=width_of(["rpc"]), max_parameters=max_parameters, thinning=thin_metres or 0.0,
     )  # fmt: skip
     create_network(place, network)
     return Created(place, cover, network)
@@ -108,45 +115,18 @@ def read_area(path: Path) -> BaseGeometry:
 def fit_catalogue(catalogue: Catalogue) -> tuple[BaseGeometry, float, float]:
     """Area of a catalogue's footprints, and the core and overlap that suit them, kilometres.
 
+    Images without a footprint in the catalogue have that of their camera.
+
     Raises
     ------
     InputError
-        When no image has a footprint, or one is not where its camera looks.
+        When no image has a footprint and no camera sees ground, or a footprint is not where its camera looks.
     """
-    footprints, path = [], required_path(catalogue.path, "images")
-    for row, image in enumerate(catalogue.images, start=1):
-        if image.footprint:
-            footprints.append(_footprint(image, catalogue.metadata.ellipsoid, f"{path}: row {row}: geometry of image {image.image_id}"))
-    if not footprints:
-        raise InputError(f"{catalogue.path}: no image has a footprint (column geometry); give the area by --bbox or --aoi")
-    west, south, east, north = shapely.total_bounds(footprints)
-    bounds = shapely.bounds(footprints)
-    metres_per_degree = np.radians(1.0) * catalogue.metadata.semimajor_axis
-    width = float(np.median((bounds[:, 3] - bounds[:, 1]) * metres_per_degree)) / 1000.0
-    return shapely.box(west, south, east, north), CORE_IN_FOOTPRINTS * width, width
-
-
-def _footprint(image: ImageRecord, ellipsoid: Ellipsoid, name: str) -> BaseGeometry:
-    """The footprint of an image, on the globe and not with its axes swapped."""
-    footprint = read_footprint(image.footprint, name)
-    if footprint.is_empty:
-        raise InputError(f"{name} is empty; expected a polygon in longitude and latitude")
-    west, south, east, north = footprint.bounds
-    longitude, latitude = _centre_on_ground(image, ellipsoid)
-    x, y = 0.5 * (west + east), 0.5 * (south + north)
-    swapped = np.hypot(x - latitude, y - longitude) < 0.1 * np.hypot((x - longitude + 180.0) % 360.0 - 180.0, y - latitude)
-    if swapped or not (-90.0 <= south <= north <= 90.0 and -360.0 <= west <= east <= 360.0):
+    shapes = image_footprints(catalogue, required_path(catalogue.path, "images"))
+    shapes = shapes[~shapely.is_empty(shapes)]
+    if not len(shapes):
         raise InputError(
-            f"{name} spans longitudes {west:g} to {east:g} and latitudes {south:g} to {north:g}, but its camera looks at longitude "
-            f"{longitude:g}, latitude {latitude:g}; "
-            + ("its axes look swapped: expected longitude first, then latitude" if swapped else "expected degrees on a globe")
+            f"{catalogue.path}: no image has a footprint (column geometry), and no camera sees ground; give the area by --bbox or --aoi"
         )
-    return footprint
-
-
-def _centre_on_ground(image: ImageRecord, ellipsoid: Ellipsoid) -> tuple[float, float]:
-    """Longitude and latitude of the middle of an image, at its camera's mean height."""
-    sensor, camera = sensor_named(image.sensor), image.pack()[None]
-    sample, line = np.array([0.5 * image.width]), np.array([0.5 * image.height])
-    at = sensor.localise(camera, np.zeros(1, dtype=np.int32), sample, line, sensor.mean_height(camera), ellipsoid)[0]
-    return float(at[0]), float(at[1])
+    width = float(np.median(footprint_widths(shapes, catalogue.metadata.ellipsoid))) / 1000.0
+    return shapely.union_all([on_globe(shape) for shape in shapes]), CORE_IN_FOOTPRINTS * width, width

@@ -9,7 +9,7 @@ import numpy as np
 
 from submin import Network
 from submin.sensors import SURVEYS
-from submin.storage.accuracy_map import accuracy_map
+from submin.storage.accuracy_map import accuracy_of_all
 from submin.storage.ledger import Ledger
 
 
@@ -20,12 +20,16 @@ def describe(network: Network) -> dict[str, Any]:
     images = snapshot.image_columns(["image_id", "sensor", "released", "withdrawn"])
     here = (images["withdrawn"] == 0) & ~np.isin(images["sensor"], SURVEYS)
     ledger = Ledger.of(snapshot)
-    accuracy = accuracy_map(network)
+    accuracy = accuracy_of_all(network)
+    reported = ~accuracy.thinned & ~accuracy.retired
     place = snapshot.place
     size = sum(f.stat().st_size for f in Path(place).rglob("*") if f.is_file()) if "://" not in place else -1
     return {
         "version": network.version,
         "points": len(accuracy.ids),
+        "points_reported": int(reported.sum()),
+        "points_thinned": int(accuracy.thinned.sum()),
+        "points_retired": int(accuracy.retired.sum()),
         "points_pending": int(sum(c["points"] for c in cells)) - len(accuracy.ids),
         "rays": int(sum(c["rays"] for c in cells)),
         "rays_rejected": int(sum(c["rays"] - c["accepted"] for c in cells)),
@@ -35,11 +39,13 @@ def describe(network: Network) -> dict[str, Any]:
         "control_points": len(ledger.control_points()),
         "control_sets": len(ledger.control_sets()),
         "tiles": len(snapshot.tile_numbers()),
+        "tiles_of_the_area": network.cover.tile_count,
         "cells": len(cells),
-        "ce90_median": float(np.median(accuracy.ce90)) if len(accuracy.ids) else float("nan"),
-        "le90_median": float(np.median(accuracy.le90)) if len(accuracy.ids) else float("nan"),
+        "ce90_median": float(np.median(accuracy.ce90[reported])) if reported.any() else float("nan"),
+        "le90_median": float(np.median(accuracy.le90[reported])) if reported.any() else float("nan"),
         "tile_km": network.cover.core / 1000.0,
         "overlap_km": network.cover.overlap / 1000.0,
+        "thin_metres": snapshot.metadata.thinning,
         "frame": snapshot.metadata.frame,
         "bytes": size,
     }

@@ -9,6 +9,7 @@ from itertools import chain, islice
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orchestration.batch import BatchResult, Rejected, fuse_batch
 from orchestration.executors import Executor
@@ -18,7 +19,7 @@ from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import InputError
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
-from submin.storage.control_blocks import control_blocks, points_of
+from submin.storage.control_blocks import control_blocks, observed_positions, points_of
 from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import writing
@@ -121,16 +122,43 @@ def run(
     check_frames(catalogue, Snapshot.open(place))
     summary = catalogue.validate()
     control = catalogue.points("control")
-    reporter.begin(summary.blocks + (0 if control is None else len(control)))
+    observed = observation_blocks(catalogue)
+    reporter.begin(summary.blocks + (0 if control is None else len(control)) + summary.clusters)
     every = chain(
-        catalogue.blocks(), () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
+        catalogue.blocks(),
+        () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control"),
+        observed,
     )
-    tally = fuse_blocks(every, place, executor, batch_blocks, reporter)
+    check = catalogue.points("check")
+    tally = fuse_blocks(
+        every, place, executor, batch_blocks, reporter, check_points=np.empty(0, dtype="U1") if check is None else check.point_ids
+    )
     return _result(Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
 
 
-def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter) -> Tally:
-    """Fuse those of some blocks that the network does not have yet, so many to a commit.
+def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:
+    """Blocks of a catalogue's clusters of positions, one after the other.
+
+    Raises
+    ------
+    InputError
+        At once, when a cluster cannot enter a factored network: it holds baselines, or its covariance is as good as singular.
+    """
+
+    def blocks() -> Iterator[Block]:
+        source = f"{catalogue.path}/observations"
+        return (observed_positions(cluster, catalogue.metadata.ellipsoid, source) for cluster in catalogue.observations())
+
+    for _ in blocks():  # all of them before anything is written
+        pass
+    return blocks()
+
+
+def fuse_blocks(
+    blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter,
+    check_points: NDArray[np.str_] | None = None,
+) -> Tally:  # fmt: skip
+    """Fuse those of some blocks that the network does not have yet, so many to a commit; it remembers ``check_points`` with them.
 
     Raises
     ------
@@ -146,7 +174,7 @@ def fuse_blocks(blocks: Iterable[Block], place: str, executor: Executor, batch_b
         while batch := list(islice(new, max(batch_blocks, 1))):
             good = [block for block, reason in batch if reason is None]
             refused = [Rejected.of(block, reason) for block, reason in batch if reason is not None]
-            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter))
+            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, check_points))
             reporter.fused(len(batch))
     return tally
 

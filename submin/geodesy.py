@@ -136,6 +136,14 @@ def local_axes(geodetic: Array) -> Array:
     return rotation
 
 
+def common_axes(geocentric: Array, ellipsoid: Ellipsoid = WGS84) -> Array:
+    """Axes (3, 3) that points (n, 3) share: rows east, north and up in their middle, or the geocentric ones all around a body."""
+    middle = geocentric.mean(axis=0) if len(geocentric) else np.zeros(3)
+    if np.linalg.norm(middle) < 0.5 * ellipsoid.semiminor_axis:
+        return np.eye(3)
+    return np.asarray(local_axes(geocentric_to_geodetic(middle[None], ellipsoid))[0])
+
+
 def rotate_covariance(covariance: Array, rotation: Array) -> Array:
     """``R P R'`` for stacks of 3 x 3 matrices (n, 3, 3)."""
     return np.asarray(rotation @ covariance @ np.swapaxes(rotation, -1, -2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from orchestration.commands.shared import Aoi, Box, Json, check_range, out, show
+from orchestration.commands.shared import Aoi, Box, Json, check_applies, check_range, out, show
 
 if TYPE_CHECKING:
     from submin.storage.network_store import Version
@@ -28,11 +29,15 @@ def query(
         Path | None, typer.Option("--points", help="CSV or Parquet with a column point_id, or text with one id a line.")
     ] = None,
     tile: Annotated[str | None, typer.Option("--tile", help="Name of a tile: its sub-MIN alone.")] = None,
-    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "auto",
+    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci, bci, split or rigorous.")] = "auto",
     at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
-    max_points: Annotated[int | None, typer.Option("--max-points", help="At most so many points, well spread.")] = None,
+    max_points: Annotated[int | None, typer.Option("--max-points", help="At most so many points, well spread and well determined.")] = None,
+    on: Annotated[str | None, typer.Option("--on", metavar="DATE", help="Day on which points must be valid; default: today (UTC).")] = None,
+    details: Annotated[
+        bool, typer.Option("--details", help="Columns status, first_block, last_block, blocks, convergence and licences too.")
+    ] = False,
     output: Annotated[
-        Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson or .csv.")
+        Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson, .csv or .gcp.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -43,20 +48,26 @@ def query(
     import submin
     from orchestration.create import read_area
     from orchestration.point_list import read_point_ids
+    from submin.storage.validity import read_date
 
     if max_points is not None:
         check_range("--max-points", max_points, 1)
+    day = None if on is None else date.fromisoformat(read_date(on, "--on"))
+    if output is None:
+        check_applies({"--details": details or None}, "--out")
     started = time.monotonic()
-    control = submin.open(network, at).query(
+    opened = submin.open(network, at)
+    control = opened.query(
         bbox=bbox, area=None if aoi is None else read_area(aoi), points=None if points is None else read_point_ids(points),
-        tile=tile, policy=policy, max_points=max_points,
+        tile=tile, policy=policy, max_points=max_points, on=day,
     )  # fmt: skip
     if output is not None:
-        control.write(output)
+        control.write(output, opened.points(points=control.ids).details() if details else {})
     seconds = time.monotonic() - started
     values = {
         "points": len(control), "policy": control.policy, "tiles": list(control.tiles), "version": control.version, "scope": control.scope,
         "blocks": len(control.blocks), "seconds": seconds, "out": None if output is None else str(output),
+        "validity": list(control.validity),
     }  # fmt: skip
     if not len(control):
         show(values, as_json, f"{network} {control.version}: no determined points there")
@@ -74,7 +85,7 @@ def query(
 def check(
     network: Annotated[str, typer.Argument(help="Network to check.")],
     points: Annotated[Path, typer.Argument(help="Table of check points, by the ids of tie points.")],
-    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "rigorous",
+    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci, bci, split or rigorous.")] = "rigorous",
     output: Annotated[Path | None, typer.Option("--out", help="Text file that takes the table too.")] = None,
     as_json: Json = False,
 ) -> None:

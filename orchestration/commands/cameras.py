@@ -21,7 +21,7 @@ def adjust(
         str | None, typer.Option("--network", help="Network that controls it; without one the catalogue's control table does, if any.")
     ] = None,
     policy: Annotated[
-        str | None, typer.Option("--policy", help="Of the network's answer: auto, tile, ci or rigorous; default auto.")
+        str | None, typer.Option("--policy", help="Of the network's answer: auto, tile, ci, bci, split or rigorous; default auto.")
     ] = None,
     at: Annotated[str | None, typer.Option("--at", help="Version of the network, such as v12.")] = None,
     max_points: Annotated[
@@ -92,7 +92,7 @@ def readjust(
     network: Annotated[str, typer.Argument(help="Network with them.")],
     output: Annotated[Path, typer.Option("--out", help="Folder to write: cameras and their covariance.")],
     block: Annotated[str | None, typer.Option("--block", help="One block only.")] = None,
-    policy: Annotated[str, typer.Option("--policy", help="Of the network's points: auto, tile, ci or rigorous.")] = "auto",
+    policy: Annotated[str, typer.Option("--policy", help="Of the network's points: auto, tile, ci, bci, split or rigorous.")] = "auto",
     deweight: Annotated[
         float | None,
         typer.Option("--deweight", metavar="F", help="For comparison: a priori covariance x F^2 instead of the rigorous form."),

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, show
+from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, counted, show
 
 app = typer.Typer()
 control_app = typer.Typer(no_args_is_help=True, help="Surveyed control points.")
@@ -30,6 +30,9 @@ def create(
     max_parameters: Annotated[
         int, typer.Option("--max-parameters", min=60, help="A tile that sees more image parameters (6 an image) is split into four.")
     ] = 2500,
+    thin_metres: Annotated[
+        float | None, typer.Option("--thin-metres", help="Report one point in each square of this side; all points keep what they know.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Make an empty network over an area.
@@ -53,10 +56,11 @@ def create(
         overlap_km = min(shared, 0.5 * tile_km) if overlap_km is None else overlap_km
     else:
         area = box_area(bbox) if bbox is not None else read_area(aoi)  # type: ignore[arg-type]
-    made = make(network, area, metadata, tile_km, overlap_km, form, max_parameters)
+    made = make(network, area, metadata, tile_km, overlap_km, form, max_parameters, thin_metres)
     cover = made.cover
-    show(made.to_json(), as_json, f"{network}: {cover.rows} x {cover.columns} tiles, cores of {cover.core / 1000:g} km, "
-         f"overlap {cover.overlap / 1000:g} km, frame {metadata.frame}")  # fmt: skip
+    thinned = "" if thin_metres is None else f", one point reported in each square of {thin_metres:g} m"
+    show(made.to_json(), as_json, f"{network}: {counted(cover.tile_count, 'tile')} ({cover.rows} rows, {cover.columns} columns), "
+         f"cores of {cover.core / 1000:g} km, overlap {cover.overlap / 1000:g} km, frame {metadata.frame}{thinned}")  # fmt: skip
 
 
 @app.command()

@@ -10,7 +10,9 @@ import typer
 from orchestration.commands.shared import Json, show
 
 if TYPE_CHECKING:
+    from submin.storage.gnss_import import GnssImport
     from submin.storage.imports import ImportSummary
+    from submin.storage.sinex_import import SolutionImport
 
 app = typer.Typer(no_args_is_help=True, help="Make a catalogue from other files.")
 
@@ -70,6 +72,82 @@ def import_isis_command(
         a_priori=camera_priors(sigma_position, sigma_attitude, sigma_focal),
     )  # fmt: skip
     _show_import(made, as_json)
+
+
+@app.command("gnss")
+def import_gnss_command(
+    file: Annotated[Path, typer.Argument(help="Measurements: DNA (.msr) or DynaML (.xml), perhaps gzipped.")],
+    catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")],
+    values: Annotated[
+        Path | None,
+        typer.Option("--values", help="CSV with cluster, type, from, to, component, the file's values and those to take instead."),
+    ] = None,
+    value_column: Annotated[str | None, typer.Option("--value-column", help="Column of --values to take; default: the last.")] = None,
+    frame: Annotated[str | None, typer.Option("--frame", help="Of the catalogue; default: that of the file's header.")] = None,
+    epoch: Annotated[str | None, typer.Option("--epoch", help="Of the catalogue; default: that of the file's header.")] = None,
+    dataset: Annotated[str | None, typer.Option("--dataset", help="Prefix of the ids; default: the folder of the file.")] = None,
+    shared_ids: Annotated[bool, typer.Option("--shared-ids", help="Keep station names as global point ids.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Make a catalogue of GNSS positions and baselines with full covariance. Nothing is transformed.
+
+    Example: submin import gnss network.msr --values transformed.csv --out catalogue
+    """
+    from submin.storage.gnss_import import import_gnss
+
+    made = import_gnss(
+        file, catalogue, values=values, value_column=value_column, frame=frame, epoch=epoch, dataset=dataset, shared_ids=shared_ids
+    )
+    _show_gnss(made, as_json)
+
+
+@app.command("sinex")
+def import_sinex_command(
+    file: Annotated[Path, typer.Argument(help="SINEX solution, or .msr or .xml with one cluster of positions; perhaps gzipped.")],
+    control: Annotated[Path, typer.Option("--out", help="Table of control to write (.parquet).")],
+    keep_constraints: Annotated[
+        bool, typer.Option("--keep-constraints", help="Take the estimate as it stands, with its a priori constraint.")
+    ] = False,
+    frame: Annotated[str | None, typer.Option("--frame", help="Frame of the coordinates; a file that states another is refused.")] = None,
+    epoch: Annotated[str | None, typer.Option("--epoch", help="Epoch of the coordinates; a file that states another is refused.")] = None,
+    prefix: Annotated[str, typer.Option("--prefix", help="Goes before each station's name in its point id.")] = "",
+    as_json: Json = False,
+) -> None:
+    """Write the positions of a geodetic solution as control with full covariance, its a priori constraint taken out.
+
+    Example: submin import sinex solution.snx.gz --out control.parquet
+    """
+    from submin.storage.sinex_import import import_solution
+
+    made = import_solution(file, control, keep_constraints=keep_constraints, frame=frame, epoch=epoch, prefix=prefix)
+    _show_solution(made, as_json)
+
+
+def _show_gnss(made: GnssImport, as_json: bool) -> None:
+    values = {
+        "catalogue": str(made.catalogue), "dataset": made.dataset, "frame": made.frame, "epoch": made.epoch, "clusters": made.clusters,
+        "positions": made.positions, "baselines": made.baselines, "points": made.points, "ignored": made.ignored,
+        "notes": list(made.notes),
+    }  # fmt: skip
+    text = (
+        f"{made.catalogue}: {made.positions:,} positions and {made.baselines:,} baselines of {made.points:,} points in {made.clusters:,} "
+        f"cluster{'s' * (made.clusters != 1)}, {' at '.join(filter(None, (made.frame, made.epoch)))}"
+    )
+    show(values, as_json, "\n".join([text, *(f"note: {note}" for note in made.notes)]))
+
+
+def _show_solution(made: SolutionImport, as_json: bool) -> None:
+    values = {
+        "control": str(made.file), "points": made.points, "frame": made.frame, "epoch": made.epoch, "constraint": made.constraint,
+        "constraint_share": made.constraint_share, "sigma_min_m": made.sigma_min, "sigma_max_m": made.sigma_max,
+        "notes": list(made.notes),
+    }  # fmt: skip
+    where = " at ".join(filter(None, (made.frame, made.epoch)))
+    text = (
+        f"{made.file}: {made.points:,} points with joint covariance{f', {where}' if where else ''}; "
+        f"standard deviations {1e3 * made.sigma_min:.3g} to {1e3 * made.sigma_max:.3g} mm"
+    )
+    show(values, as_json, "\n".join([text, *(f"note: {note}" for note in made.notes)]))
 
 
 def _show_import(made: ImportSummary, as_json: bool) -> None:

@@ -63,8 +63,15 @@ def table_path(folder: Path, stem: str) -> Path | None:
     return found[0] if found else None
 
 
-def table_batches(path: Path, columns: Collection[Column]) -> Iterator[tuple[int, pa.RecordBatch]]:
+def numbers(name: str, required: bool = True) -> Column:
+    """A column of lists of numbers; in CSV a text of numbers with blanks between them."""
+    return Column(name, pa.list_(pa.float64()), required)
+
+
+def table_batches(path: Path, columns: Collection[Column], batch_rows: int = BATCH_ROWS) -> Iterator[tuple[int, pa.RecordBatch]]:
     """Batches of rows of a Parquet or CSV file with the number of their first row, in bounded memory.
+
+    A batch of a Parquet file has ``batch_rows`` rows at most: fewer for tables whose rows hold much.
 
     A batch holds those of ``columns`` that the file has, in their types. Texts that must be given are neither null nor empty.
 
@@ -75,10 +82,9 @@ def table_batches(path: Path, columns: Collection[Column]) -> Iterator[tuple[int
     """
     if not path.is_file():
         raise CatalogueError(f"{path}: no such file; expected a table with columns {_listed(columns)}")
-    reading = _parquet_batches if path.suffix == ".parquet" else _csv_batches
     try:
         row = 1
-        for batch in reading(path, columns):
+        for batch in _parquet_batches(path, columns, batch_rows) if path.suffix == ".parquet" else _csv_batches(path, columns):
             present = [c for c in columns if c.name in batch.schema.names]
             arrays = [_typed(batch.column(c.name), c, path, row) for c in present]
             yield row, pa.RecordBatch.from_arrays(arrays, schema=pa.schema([(c.name, c.type) for c in present]))
@@ -92,6 +98,37 @@ def table_batches(path: Path, columns: Collection[Column]) -> Iterator[tuple[int
         if foreign:
             raise CatalogueError(f"{path}: row {int(foreign[1]) - 1}: text is not UTF-8; save the file in that encoding") from None
         raise CatalogueError(f"{path}: cannot be read as a table ({reason.rstrip('.')}); write or copy it again") from None
+
+
+def table_runs(
+    path: Path, columns: Collection[Column], key: str, what: str, batch_rows: int = BATCH_ROWS
+) -> Iterator[tuple[str, int, pa.Table]]:
+    """The rows of each value of the column ``key`` with the number of their first row; memory is bounded by them and one batch.
+
+    Raises
+    ------
+    CatalogueError
+        As `table_batches`, and when a value comes back after another one: the table is not sorted by ``what``.
+    """
+    seen: set[str] = set()
+    current, first_row, pieces = "", 1, list[pa.RecordBatch]()
+    for row, batch in table_batches(path, columns, batch_rows):
+        runs = pc.run_end_encode(batch[key])
+        start = 0
+        for value, stop in zip(runs.values.to_pylist(), runs.run_ends.to_pylist(), strict=True):
+            if value != current:
+                if pieces:
+                    yield current, first_row, pa.Table.from_batches(pieces)
+                if value in seen:
+                    raise CatalogueError(
+                        f"{path}: row {row + start}: {key} {value!r} comes back after {current!r}; expected rows sorted by {what}"
+                    )
+                seen.add(value)
+                current, first_row, pieces = value, row + start, []
+            pieces.append(batch.slice(start, stop - start))
+            start = stop
+    if pieces:
+        yield current, first_row, pa.Table.from_batches(pieces)
 
 
 def column_names(path: Path) -> tuple[str, ...]:
@@ -159,10 +196,10 @@ def _present(path: Path, names: Collection[str], columns: Collection[Column]) ->
     return [c.name for c in columns if c.name in names]
 
 
-def _parquet_batches(path: Path, columns: Collection[Column]) -> Iterator[pa.RecordBatch]:
+def _parquet_batches(path: Path, columns: Collection[Column], batch_rows: int) -> Iterator[pa.RecordBatch]:
     with pq.ParquetFile(path, pre_buffer=False) as file:
         names = _present(path, file.schema_arrow.names, columns)
-        yield from file.iter_batches(batch_size=BATCH_ROWS, columns=names, use_threads=False)
+        yield from file.iter_batches(batch_size=batch_rows, columns=names, use_threads=False)
 
 
 def _csv_batches(path: Path, columns: Collection[Column]) -> Iterator[pa.RecordBatch]:
@@ -188,6 +225,8 @@ def _typed(array: pa.Array, column: Column, path: Path, first_row: int) -> pa.Ar
         return array
     if column.type == pa.binary():
         return _well_known_binary(array, path, first_row) if is_text else _cast(array, column, path, first_row)
+    if is_text and path.suffix != ".parquet" and pa.types.is_list(column.type):
+        return _lists(array, column, path, first_row)
     if is_text and path.suffix != ".parquet":
         array = pc.utf8_trim_whitespace(array)
         array = pc.if_else(pc.equal(array, ""), pa.scalar(None, pa.string()), array)
@@ -217,6 +256,19 @@ def _cast(array: pa.Array, column: Column, path: Path, first_row: int) -> pa.Arr
         raise CatalogueError(
             f"{path}: row {first_row + low}: {column.name} is {array[low].as_py()!r}; expected a {_meaning(column)}"
         ) from None
+
+
+def _lists(array: pa.Array, column: Column, path: Path, first_row: int) -> pa.Array:
+    """Lists of numbers from the texts of a CSV file; an empty text is null."""
+    lists: list[list[float] | None] = []
+    for k, value in enumerate(array.to_pylist()):
+        try:
+            lists.append([float(v) for v in value.split()] if value and value.strip() else None)
+        except ValueError:
+            raise CatalogueError(
+                f"{path}: row {first_row + k}: {column.name} is {value[:60]!r}; expected numbers with blanks between them"
+            ) from None
+    return pa.array(lists, column.type)
 
 
 def _well_known_binary(array: pa.Array, path: Path, first_row: int) -> pa.Array:

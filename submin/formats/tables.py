@@ -1,4 +1,4 @@
-"""Tables of points with their joint covariance: Parquet, NumPy archive, GeoJSON and CSV (layout: docs/interface.md, "Query output").
+"""Tables of points with their joint covariance: Parquet, NumPy archive, GeoJSON, CSV and GCP (layout: docs/interface.md, "Query output").
 
 One row a point with the columns `POINT_COLUMNS`: geocentric metres, degrees and ellipsoidal height, the covariance of the point in its
 local axes (m2), CE90 and LE90 (m), owner tile and number of rays. The joint covariance is geocentric, m2, point-major.
@@ -11,6 +11,7 @@ file          joint covariance                                        metadata
 ``.npz``      array ``covariance`` (3n, 3n)                           arrays without dimension, lists (k,)
 ``.geojson``  no                                                      member ``metadata``
 ``.csv``      no                                                      no
+``.gcp``      no                                                      no
 ============  ======================================================  =====================================
 
 A file is written under a temporary name in its folder and then renamed: a write that fails leaves what was there before.
@@ -48,7 +49,7 @@ POINT_COLUMNS = (
 
 TEXTS = ("policy", "version", "frame", "epoch", "scope")
 NUMBERS = ("semimajor_axis", "flattening")
-LISTS = ("tiles", "blocks")
+LISTS = ("tiles", "blocks", "validity")
 
 _GROUP_VALUES = 2**23
 """Values of the triangle in one row group of a Parquet file: 64 MiB, so that a large covariance is never held twice."""
@@ -60,7 +61,7 @@ class ControlTable:
 
     Attributes
     ----------
-    columns : the arrays (n,) named in `POINT_COLUMNS`
+    columns : the arrays (n,) named in `POINT_COLUMNS`, and after them others that describe the points
     covariance : (3n, 3n), m2, joint, geocentric axes, point-major, symmetric
     metadata : the texts, numbers and lists of texts named in `TEXTS`, `NUMBERS` and `LISTS`
     """
@@ -70,7 +71,7 @@ class ControlTable:
     metadata: Metadata
 
     def __post_init__(self) -> None:
-        if tuple(self.columns) != POINT_COLUMNS:
+        if tuple(self.columns)[: len(POINT_COLUMNS)] != POINT_COLUMNS:
             raise InputError(f"table: columns are {', '.join(self.columns)}; expected {', '.join(POINT_COLUMNS)}")
         n = len(self.columns["point_id"])
         if self.covariance.shape != (3 * n, 3 * n):
@@ -78,7 +79,7 @@ class ControlTable:
 
 
 def write_table(path: str | Path, table: ControlTable) -> None:
-    """Write a table in the format that the suffix of the path names: ``.parquet``, ``.npz``, ``.geojson`` or ``.csv``.
+    """Write a table in the format that the suffix of the path names: ``.parquet``, ``.npz``, ``.geojson``, ``.csv`` or ``.gcp``.
 
     Raises
     ------
@@ -103,7 +104,7 @@ def write_parquet(path: str | Path, table: ControlTable) -> None:
     schema = points.schema.append(pa.field("covariance_row", pa.list_(pa.float64()))).with_metadata(metadata)
     # A dictionary pays for tile names only; tried on a covariance it costs time and gains nothing.
     with replacing(path) as temporary, pq.ParquetWriter(temporary, schema, use_dictionary=["tile"]) as writer:
-        for first, last in _row_groups(points.num_rows):
+        for first, last in row_groups(points.num_rows):
             rows = covariance_rows(table.covariance, first, last)
             group = points.slice(first, last - first).append_column("covariance_row", rows)
             writer.write_table(group.cast(schema))
@@ -124,10 +125,14 @@ def write_geojson(path: str | Path, table: ControlTable) -> None:
 
     The joint covariance is not in it: each point carries its own 3 x 3 covariance only.
     """
-    points = _point_columns(table)
-    places = np.column_stack([table.columns[c] for c in ("longitude", "latitude", "height")]).astype(np.float64, copy=False)
+    write_features(path, _point_columns(table), table.metadata)
+
+
+def write_features(path: str | Path, points: pa.Table, metadata: Metadata) -> None:
+    """Write the rows of a table as features at its longitude, latitude and height, with its columns as properties."""
+    places = np.column_stack([points[c].to_numpy() for c in ("longitude", "latitude", "height")])
     n = points.num_rows
-    coordinates = pa.FixedSizeListArray.from_arrays(pa.array(places.ravel()), 3)
+    coordinates = pa.FixedSizeListArray.from_arrays(pa.array(places.ravel(), pa.float64()), 3)
     features = pa.table(
         {
             "type": pa.repeat("Feature", n),
@@ -135,7 +140,7 @@ def write_geojson(path: str | Path, table: ControlTable) -> None:
             "properties": points.to_struct_array().combine_chunks() if n else pa.array([], pa.struct(list(points.schema))),
         }
     )
-    collection = {"type": "FeatureCollection", "metadata": dict(table.metadata), "features": features.to_pylist()}
+    collection = {"type": "FeatureCollection", "metadata": dict(metadata), "features": features.to_pylist()}
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(collection, ensure_ascii=False, allow_nan=False), encoding="utf-8")
 
@@ -149,7 +154,32 @@ def write_csv(path: str | Path, table: ControlTable) -> None:
         pa_csv.write_csv(_point_columns(table), str(temporary))
 
 
-_WRITERS = {".parquet": write_parquet, ".npz": write_npz, ".geojson": write_geojson, ".csv": write_csv}
+def write_gcp(path: str | Path, table: ControlTable) -> None:
+    """Write ground control points as text, as the bundle adjustment of the Ames Stereo Pipeline takes them.
+
+    A line a point: number, latitude, longitude (degrees), ellipsoidal height, and the standard deviations of geocentric x, y, z (m), with
+    blanks between them. Whoever measures a point in an image appends name, column, row and their sigmas. The numbers are the point ids
+    where all of these are whole numbers, else 1, 2, ... in the order of the table.
+
+    The format takes x, y and z as independent. So that they claim no more accuracy than the covariance P of the point, they are those of
+    ``lambda diag(P)``, lambda the greatest eigenvalue of its correlations (1 to 3): no combination of them is below that of P. What is
+    correlated between points is not in the file.
+    """
+    ids = [str(v) for v in table.columns["point_id"]]
+    whole = all(v.isdecimal() and v.isascii() and v == str(int(v)) for v in ids)
+    n = len(ids)
+    own = table.covariance.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+    sigma = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    greatest = np.linalg.eigvalsh(own / (sigma[:, :, None] * sigma[:, None, :]))[:, -1]
+    sigma = sigma * np.sqrt(greatest)[:, None] * (1.0 + 5e-6)  # six digits are printed, none of them below
+    places = np.column_stack([table.columns[c] for c in ("latitude", "longitude", "height")])
+    rows = zip(ids if whole else range(1, n + 1), places.tolist(), sigma.tolist(), strict=True)
+    lines = [f"{number} {a:.11f} {b:.11f} {h:.5f} {x:.6g} {y:.6g} {z:.6g}" for number, (a, b, h), (x, y, z) in rows]
+    with replacing(path) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
+
+
+_WRITERS = {".parquet": write_parquet, ".npz": write_npz, ".geojson": write_geojson, ".csv": write_csv, ".gcp": write_gcp}
 
 
 def read_parquet(path: str | Path) -> Arrays:
@@ -211,7 +241,7 @@ def covariance_rows(covariance: Array, first: int, last: int) -> pa.ListArray:
     return pa.ListArray.from_arrays(pa.array(offsets), pa.array(np.asarray(values, dtype=np.float64)))
 
 
-def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> Array:
+def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str, first_row: int = 0) -> Array:
     """Joint covariance (3n, 3n), symmetric, of the chunks of a column ``covariance_row`` of n points in their order.
 
     Parameters
@@ -222,6 +252,8 @@ def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> 
         n.
     source : str
         File named in errors.
+    first_row : int
+        Its row of the first point, in errors.
 
     Raises
     ------
@@ -232,7 +264,7 @@ def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> 
     first = 0
     for chunk in chunks:
         last = first + len(chunk)
-        lower, values = _lower(first, last), _row_values(chunk, first, source)
+        lower, values = _lower(first, last), _row_values(chunk, first, source, first_row)
         rows = covariance[3 * first : 3 * last, : 3 * last]
         rows[lower] = values
         covariance[: 3 * first, 3 * first : 3 * last] = rows[:, : 3 * first].T
@@ -242,7 +274,7 @@ def covariance_of_rows(chunks: Iterable[pa.Array], points: int, source: str) -> 
     return covariance
 
 
-def _row_values(chunk: pa.Array, first: int, source: str) -> Array:
+def _row_values(chunk: pa.Array, first: int, source: str, first_row: int) -> Array:
     """Values of consecutive covariance rows, checked, of which the first is that of point ``first``."""
     if not (pa.types.is_list(chunk.type) or pa.types.is_large_list(chunk.type)):
         raise InputError(f"{source}: column 'covariance_row' is of type {chunk.type}; expected lists of float64")
@@ -251,7 +283,8 @@ def _row_values(chunk: pa.Array, first: int, source: str) -> Array:
     if (lengths != expected).any():
         i = int(np.argmax(lengths != expected))
         raise InputError(
-            f"{source}: row {first + i}: covariance_row has {lengths[i]} values; expected {expected[i]} (3 x 3(i+1) for row i from 0). "
+            f"{source}: row {first_row + first + i}: covariance_row has {lengths[i]} values; expected {expected[i]} "
+            "(3 x 3(i+1) for row i from 0). "
             "Rows that were taken out or sorted differently have lost their meaning: query again for other points"
         )
     try:
@@ -261,7 +294,7 @@ def _row_values(chunk: pa.Array, first: int, source: str) -> Array:
     bad = ~np.isfinite(values)
     if bad.any():
         i = int(np.searchsorted(np.cumsum(expected), np.argmax(bad), side="right"))
-        raise InputError(f"{source}: row {first + i}: covariance_row holds a value that is null or not finite; expected m2")
+        raise InputError(f"{source}: row {first_row + first + i}: covariance_row holds a value that is null or not finite; expected m2")
     return values
 
 
@@ -276,7 +309,7 @@ def _lower(first: int, last: int) -> NDArray[np.bool_]:
     return np.asarray(np.arange(3 * last)[None, :] < end[:, None])
 
 
-def _row_groups(points: int) -> Iterator[tuple[int, int]]:
+def row_groups(points: int) -> Iterator[tuple[int, int]]:
     """First and last (excluded) point of each row group; a group ends where it reaches `_GROUP_VALUES`."""
     group = np.cumsum(_lengths(0, points)) // _GROUP_VALUES
     edges = [0, *(np.flatnonzero(np.diff(group)) + 1).tolist(), points]
@@ -285,8 +318,13 @@ def _row_groups(points: int) -> Iterator[tuple[int, int]]:
 
 def _point_columns(table: ControlTable) -> pa.Table:
     """The point columns as an Arrow table with the types of the layout."""
-    types = {"point_id": pa.string(), "tile": pa.string(), "rays": pa.int64()}
-    return pa.table({k: pa.array(v, types.get(k, pa.float64())) for k, v in table.columns.items()})
+    types = dict.fromkeys(POINT_COLUMNS, pa.float64()) | {"point_id": pa.string(), "tile": pa.string(), "rays": pa.int64()}
+    return arrow_table(table.columns, types)
+
+
+def arrow_table(columns: Mapping[str, NDArray[Any]], types: Mapping[str, pa.DataType]) -> pa.Table:
+    """Columns as an Arrow table. Those of a type keep what is not a number; in the others it is no value."""
+    return pa.table({k: pa.array(v, types.get(k), from_pandas=k not in types) for k, v in columns.items()})
 
 
 def _arrays(columns: Mapping[str, NDArray[Any]], covariance: Array, metadata: Metadata) -> Arrays:

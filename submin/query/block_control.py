@@ -74,7 +74,7 @@ def control_of_block(
 ) -> NetworkControl | None:
     """Those of a block's points ``ids`` (in ``cells``, see `points_named`) that a network can answer for, as control; None without any.
 
-    ``most``: at most so many, well spread. ``network_images`` is the number of images in the network.
+    ``most``: at most so many, well spread and well determined. ``network_images`` is the number of images in the network.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def control_of_block(
     check_policy(policy)
     selections, _ = points_named(source, ids, cells)
     if most is not None:
-        selections = well_spread(selections, most)
+        selections = well_spread(source, selections, most)
     kept, parts = determined_parts(source, selections)
     if not parts:
         return None

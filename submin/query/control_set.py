@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin import accuracy
+from submin.correlation.compact import AUTO, CompactCovariance, condense
 from submin.errors import InputError, QueryError
 from submin.formats import tables
-from submin.geodesy import Ellipsoid, geocentric_to_geodetic, local_axes, rotate_covariance
+from submin.geodesy import Ellipsoid, common_axes, geocentric_to_geodetic, local_axes, rotate_covariance
 
 Array = NDArray[np.float64]
 
@@ -64,6 +65,8 @@ class ControlSet:
         Version of the network, such as ``v12``.
     scope : str
         ``network`` when the answer equals that of the monolithic network, else ``tiles``.
+    validity : tuple of str
+        ``ID FROM/TO`` for every point of which a first or last day is known: an ISO 8601 interval, ``..`` where it is open.
 
     Raises
     ------
@@ -84,6 +87,7 @@ class ControlSet:
     version: str
     blocks: tuple[str, ...]
     scope: str
+    validity: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.ids)
@@ -178,6 +182,7 @@ class ControlSet:
         if outside.any():
             raise QueryError(f"subset: there is no point {chosen[outside][0]}; expected 0 to {len(self) - 1} ({len(self)} points)")
         rows = (3 * chosen.astype(np.intp)[:, None] + np.arange(3)).ravel()
+        here = set(self.ids[chosen].tolist())
         return replace(
             self,
             ids=self.ids[chosen],
@@ -185,7 +190,29 @@ class ControlSet:
             covariance=self.covariance[np.ix_(rows, rows)],
             tile_of_point=self.tile_of_point[chosen],
             rays=self.rays[chosen],
+            validity=tuple(dated for dated in self.validity if dated.rsplit(" ", 1)[0] in here),
         )
+
+    def compact(self, family: str = AUTO, rank: int = 0, floor: float | None = None) -> CompactCovariance:
+        """The joint covariance condensed to each point's own covariance and correlation functions, with the factor that makes it a bound.
+
+        `submin.correlation.expand` makes a joint covariance of it again, which is nowhere smaller than that of the set.
+
+        Parameters
+        ----------
+        family : name of a family of correlation functions (docs/correlation.md), or ``auto``: the one that enlarges least
+        rank : number of vectors kept beside the functions: 3n numbers each, and the covariance is enlarged less
+        floor : metres from which on points are uncorrelated at the latest, but for the vectors; for families with zero floor
+
+        Raises
+        ------
+        InputError
+            When the family is unknown or not positive definite in space, there are too few or too many points, or rank or floor are out
+            of range.
+        NumericalError
+            When a point's own covariance is not positive definite.
+        """
+        return condense(self.covariance, self.geocentric, common_axes(self.geocentric, self.ellipsoid), family, rank, floor)
 
     def table(self) -> tables.ControlTable:
         """Columns, joint covariance and metadata as they are written to files."""
@@ -220,10 +247,14 @@ class ControlSet:
             "tiles": self.tiles,
             "blocks": self.blocks,
         }
+        if self.validity:
+            metadata = {**metadata, "validity": self.validity}
         return tables.ControlTable(columns, self.covariance, metadata)
 
-    def write(self, path: str | Path) -> None:
-        """Write to a file of the format that its suffix names: ``.parquet``, ``.npz``, ``.geojson`` or ``.csv``.
+    def write(self, path: str | Path, details: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Write to a file of the format that its suffix names: ``.parquet``, ``.npz``, ``.geojson``, ``.csv`` or ``.gcp``.
+
+        ``details``: further columns (n,), such as those of `PointMetadata.details` for the same points.
 
         Raises
         ------
@@ -232,7 +263,8 @@ class ControlSet:
         InputError
             When the folder does not exist.
         """
-        tables.write_table(path, self.table())
+        table = self.table()
+        tables.write_table(path, replace(table, columns={**table.columns, **(details or {})}))
 
     def to_parquet(self, path: str | Path) -> None:
         """Write points, joint covariance and metadata; see `submin.formats.tables.write_parquet`."""

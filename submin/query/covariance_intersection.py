@@ -19,9 +19,10 @@ import scipy.linalg as la
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from submin.adjustment.estimation import cholesky, reduced_information
-from submin.network.sub_min import GroundPart, SubMin, add_sums, factor, loadings
-from submin.query.source import Index, NetworkSource, existing_cells
+from submin.adjustment.estimation import cholesky
+from submin.network.sub_min import GroundPart, SubMin
+from submin.query.padded_tiles import padded_tiles
+from submin.query.source import Index, NetworkSource
 
 Array = NDArray[np.float64]
 
@@ -31,21 +32,9 @@ CERTIFICATE = 1e-6
 
 def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: Sequence[GroundPart]) -> SubMin:
     """A posteriori state of all images that the tiles see, by Covariance Intersection with weights best for the points of ``parts``."""
-    cells = existing_cells(source, tiles)
-    sums = [source.cell_sums(cell) for cell in cells]
-    rows = np.unique(np.concatenate([of_cell for of_cell, _ in sums])).astype(np.int32)
-    image_set = source.image_set(rows)
-    prior, p = image_set.prior, image_set.parameters
-    holds = np.array([[float(tile in source.cover.holders(cell)) for cell in cells] for tile in tiles])
-    if len(tiles) == 1:
-        weights = np.ones(1)
-    else:
-        information = np.stack(
-            [reduced_information(add_sums(sums, rows, p, list(held)).information, prior) for held in holds]
-        )  # fmt: skip
-        seen = loadings(parts, rows, p) @ prior
-        weights = intersection_weights(information, np.asarray((seen.T @ seen).todense()))
-    return factor(add_sums(sums, rows, p, list(weights @ holds)), rows, image_set)
+    padded = padded_tiles(source, tiles)
+    weights = np.ones(1) if len(tiles) == 1 else intersection_weights(padded.of_tiles, padded.functionals(parts))
+    return padded.weighted(padded.holds @ weights, 1.0)
 
 
 def intersection_weights(information: Array, functionals: Array) -> Array:

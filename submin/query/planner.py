@@ -11,12 +11,14 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
+from submin.adjustment.elimination import PointFactors
 from submin.errors import QueryError
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.cell import Cell, factors
 from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate
-from submin.query import covariance_intersection, rigorous, tile
+from submin.query import bounded_inflation, covariance_intersection, rigorous, split_intersection, tile
 from submin.query.source import Index, NetworkSource
+from submin.query.spread import spread_rows
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -25,6 +27,8 @@ Policy = Callable[[NetworkSource, Sequence[int], Index, Sequence[GroundPart]], S
 POLICIES: dict[str, Policy] = {
     "tile": tile.estimate,
     "ci": covariance_intersection.estimate,
+    "bci": bounded_inflation.estimate,
+    "split": split_intersection.estimate,
     "rigorous": rigorous.estimate,
 }
 """Merge policies. A new one is one file, one line here and one row in the table of `tests/property/test_policies.py`."""
@@ -67,8 +71,11 @@ class Answer:
     network_wide: bool
 
 
-def points_in_area(source: NetworkSource, area: BaseGeometry) -> list[Selection]:
-    """Determined points whose latest position lies in an area (longitude and latitude, degrees)."""
+def points_in_area(source: NetworkSource, area: BaseGeometry, every: bool = False) -> list[Selection]:
+    """Determined points whose latest position lies in an area (longitude and latitude, degrees).
+
+    With ``every`` also points of fewer than two rays, and those whose registered position alone lies in the area.
+    """
     near = set(cells_near(source, area))
     selections = []
     for number in source.cell_numbers():
@@ -77,21 +84,32 @@ def points_in_area(source: NetworkSource, area: BaseGeometry) -> list[Selection]
         cell = source.cell(number)
         at = geocentric_to_geodetic(cell.linearised_at, source.cover.ellipsoid)
         inside = np.asarray(shapely.intersects_xy(area, at[:, 0], at[:, 1]), dtype=bool)
-        selections.append(Selection(cell, np.flatnonzero(inside & _determined(cell))))
+        if every:
+            at = geocentric_to_geodetic(cell.origin, source.cover.ellipsoid)
+            inside |= shapely.intersects_xy(area, at[:, 0], at[:, 1])
+        selections.append(Selection(cell, np.flatnonzero(inside & _wanted(cell, every))))
     return [s for s in selections if len(s.rows)]
 
 
-def points_of_tile(source: NetworkSource, number: int) -> list[Selection]:
-    """All determined points that a tile holds."""
+def all_points(source: NetworkSource) -> list[Selection]:
+    """All determined points of a network."""
+    cells = [source.cell(number) for number in source.cell_numbers()]
+    return [s for s in (Selection(cell, np.flatnonzero(_wanted(cell, every=False))) for cell in cells) if len(s.rows)]
+
+
+def points_of_tile(source: NetworkSource, number: int, every: bool = False) -> list[Selection]:
+    """All determined points that a tile holds; with ``every`` also those of fewer than two rays."""
     existing = set(source.cell_numbers())
     cells = [source.cell(cell) for cell in source.cover.cells_held(number) if cell in existing]
-    return [s for s in (Selection(cell, np.flatnonzero(_determined(cell))) for cell in cells) if len(s.rows)]
+    return [s for s in (Selection(cell, np.flatnonzero(_wanted(cell, every))) for cell in cells) if len(s.rows)]
 
 
-def points_named(source: NetworkSource, ids: NDArray[np.str_], cells: Rows) -> tuple[list[Selection], NDArray[np.str_]]:
+def points_named(
+    source: NetworkSource, ids: NDArray[np.str_], cells: Rows, every: bool = False
+) -> tuple[list[Selection], NDArray[np.str_]]:
     """Points by id, with the cell (n,) where the directory says that each is; and the ids of those that cannot be answered for.
 
-    A point that is not in the network, or that its rays do not determine yet, cannot.
+    A point that is not in the network, or (without ``every``) that its rays do not determine yet, cannot.
     """
     found = np.zeros(len(ids), dtype=bool)
     selections = []
@@ -99,7 +117,7 @@ def points_named(source: NetworkSource, ids: NDArray[np.str_], cells: Rows) -> t
         cell = source.cell(int(number))
         wanted = np.flatnonzero(cells == number)
         row = np.minimum(np.searchsorted(cell.point_ids, ids[wanted]), max(len(cell) - 1, 0))
-        held = (cell.point_ids[row] == ids[wanted]) & _determined(cell)[row] if len(cell) else np.zeros(len(wanted), dtype=bool)
+        held = (cell.point_ids[row] == ids[wanted]) & _wanted(cell, every)[row] if len(cell) else np.zeros(len(wanted), dtype=bool)
         found[wanted[held]] = True
         selections.append(Selection(cell, np.unique(row[held])))
     return [s for s in selections if len(s.rows)], ids[~found]
@@ -122,32 +140,32 @@ def cells_near(source: NetworkSource, area: BaseGeometry) -> list[int]:
     return near
 
 
-def well_spread(selections: Sequence[Selection], most: int) -> list[Selection]:
-    """At most so many of the points: those with the most rays, one in each square of a grid fine enough."""
-    total = sum(len(s.rows) for s in selections)
-    if total <= most:
+def well_spread(source: NetworkSource, selections: Sequence[Selection], most: int) -> list[Selection]:
+    """All of the points when they are no more than ``most``, else so many of those that their rays determine; see `spread_rows`.
+
+    They are spread by registered positions, and compared by the trace of their own part D: what other rays of the same images could not
+    give them.
+
+    Raises
+    ------
+    QueryError
+        When ``most`` is below 1.
+    """
+    if most < 1:
+        raise QueryError(f"max_points is {most}; expected 1 or more")
+    if sum(len(s.rows) for s in selections) <= most:
         return list(selections)
-    at = np.concatenate([s.cell.linearised_at[s.rows] for s in selections])
-    rays = np.concatenate([ray_counts(s.cell)[s.rows] for s in selections])
-    ids = np.concatenate([s.cell.point_ids[s.rows] for s in selections])
-    order = np.lexsort((ids, -rays))
-    low, high = 0.0, float(np.ptp(at, axis=0).max()) + 1.0
-    chosen = order[:1]
-    for _ in range(40):  # bisection for the finest grid that has no more occupied squares than points wanted
-        side = 0.5 * (low + high)
-        square = np.floor((at[order] - at.min(axis=0)) / side).astype(np.int64)
-        _, first = np.unique(square, axis=0, return_index=True)
-        if len(first) <= most:
-            chosen, high = order[first], side
-        else:
-            low = side
-    starts = np.cumsum([0, *(len(s.rows) for s in selections)])
-    kept = np.sort(chosen)
-    thinned = [
-        Selection(s.cell, s.rows[kept[(kept >= start) & (kept < start + len(s.rows))] - start])
-        for s, start in zip(selections, starts, strict=False)
-    ]
-    return [s for s in thinned if len(s.rows)]
+    kept, parts = determined_parts(source, selections)
+    if sum(len(s.rows) for s in kept) <= most:
+        return kept
+    at = geocentric_to_geodetic(np.concatenate([part.origin for part in parts]), source.cover.ellipsoid)
+    variance = np.concatenate([np.trace(part.factors.own, axis1=1, axis2=2) for part in parts])
+    ids = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
+    chosen = spread_rows(np.stack(source.cover.plane(at[:, 0], at[:, 1]), axis=1), variance, ids, most)
+    ends = np.cumsum([len(s.rows) for s in kept])
+    found = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
+    spread = [Selection(s.cell, s.rows[rows - end + len(s.rows)]) for s, rows, end in zip(kept, found, ends, strict=True)]
+    return [s for s in spread if len(s.rows)]
 
 
 def check_policy(policy: str) -> None:
@@ -190,7 +208,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
         np.concatenate([np.full(len(s.rows), source.cover.owner(s.cell.number)) for s in kept])[order],
         np.concatenate([ray_counts(s.cell)[s.rows] for s in kept])[order],
         policy, tuple(tiles), state.images,
-        policy != "ci" and held.issuperset(source.cell_numbers()),
+        policy in ("tile", "rigorous") and held.issuperset(source.cell_numbers()),
     )  # fmt: skip
 
 
@@ -229,8 +247,7 @@ def ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection,
     cell = selection.cell
     images = source.image_set(cell.images)
     linear, point_factors = factors(cell, images, selection.rows)
-    own = np.trace(point_factors.own, axis1=1, axis2=2)
-    good = (point_factors.rank == 3) & (np.where(point_factors.rank == 3, own, np.inf) < DETERMINED_METRES**2)
+    good = determined_by(point_factors)
     if not good.all():
         return ground_part(source, Selection(cell, selection.rows[good]))
     rows = cell.images[linear.image]
@@ -242,10 +259,16 @@ def ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection,
     return selection, part
 
 
+def determined_by(point_factors: PointFactors) -> NDArray[np.bool_]:
+    """True (n,) for points that their rays determine well enough to be reported as control points."""
+    own = np.trace(point_factors.own, axis1=1, axis2=2)
+    return np.asarray((point_factors.rank == 3) & (np.where(point_factors.rank == 3, own, np.inf) < DETERMINED_METRES**2))
+
+
 def ray_counts(cell: Cell) -> Rows:
     """Accepted rays (n,) of each of the cell's points."""
     return np.bincount(cell.rays.point[cell.rays.accepted], minlength=len(cell))
 
 
-def _determined(cell: Cell) -> NDArray[np.bool_]:
-    return ray_counts(cell) >= 2
+def _wanted(cell: Cell, every: bool) -> NDArray[np.bool_]:
+    return ray_counts(cell) >= (0 if every else 2)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from datetime import date
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from submin.network.sub_min import GroundPart, loadings, locate, point_covarianc
 from submin.query.planner import Selection, ground_part, ray_counts
 from submin.storage.network import Network
 from submin.storage.schema import determined
+from submin.storage.validity import today
 
 Array = NDArray[np.float64]
 
@@ -28,6 +30,7 @@ class PointAccuracy:
     ce90, le90 : (n,) metres
     tile : (n,) name of the tile whose core holds each point
     rays : (n,) accepted rays of each
+    thinned, retired : (n,) points that answers for areas leave out: because one a square is reported, because of their dates
     """
 
     ids: NDArray[np.str_]
@@ -36,20 +39,30 @@ class PointAccuracy:
     le90: Array
     tile: NDArray[np.str_]
     rays: NDArray[np.int64]
+    thinned: NDArray[np.bool_]
+    retired: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.ids)
 
 
-def accuracy_map(network: Network) -> PointAccuracy:
+def accuracy_map(network: Network, on: date | None = None) -> PointAccuracy:
+    """Position and accuracy of every point that the network reports on a day (default: today, UTC); see `accuracy_of_all`."""
+    every = accuracy_of_all(network, on)
+    reported = ~every.thinned & ~every.retired
+    return every if reported.all() else PointAccuracy(*(getattr(every, field.name)[reported] for field in fields(every)))
+
+
+def accuracy_of_all(network: Network, on: date | None = None) -> PointAccuracy:
     """Position and accuracy of every determined point, as policy ``tile`` has them from the tile whose core holds the point.
 
     Points whose rays determine no position are left out. Memory is that of one tile's sub-MIN and of its own points.
     """
-    return _joined([_of_tile(network, tile) for tile in network.snapshot.tile_numbers()])
+    day = today() if on is None else on
+    return _joined([_of_tile(network, tile, day) for tile in network.snapshot.tile_numbers()])
 
 
-def _of_tile(network: Network, tile: int) -> PointAccuracy:
+def _of_tile(network: Network, tile: int, day: date) -> PointAccuracy:
     """Accuracy of the points in a tile's own core."""
     existing = set(network.cell_numbers())
     kept: list[Selection] = []
@@ -76,12 +89,14 @@ def _of_tile(network: Network, tile: int) -> PointAccuracy:
         le90=accuracy.le90(local[:, 2, 2]),
         tile=np.full(len(geodetic), network.cover.tile_name(tile)),
         rays=np.concatenate([ray_counts(s.cell)[s.rows] for s in kept]),
+        thinned=np.concatenate([~network.left_by_thinning(s.cell)[s.rows] for s in kept]),
+        retired=np.concatenate([~network.validity.valid(s.cell.point_ids[s.rows], day) for s in kept]),
     )
 
 
 def _joined(parts: list[PointAccuracy]) -> PointAccuracy:
     none = PointAccuracy(
-        np.empty(0, dtype="U1"), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, dtype="U1"), np.empty(0, dtype=np.int64)
-    )
-    names = ("ids", "geodetic", "ce90", "le90", "tile", "rays")
-    return PointAccuracy(*(np.concatenate([getattr(part, name) for part in (none, *parts)]) for name in names))
+        np.empty(0, dtype="U1"), np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0, dtype="U1"), np.empty(0, dtype=np.int64),
+        np.empty(0, dtype=np.bool_), np.empty(0, dtype=np.bool_),
+    )  # fmt: skip
+    return PointAccuracy(*(np.concatenate([getattr(part, field.name) for part in (none, *parts)]) for field in fields(none)))

@@ -11,6 +11,7 @@ import zarr
 from numpy.typing import NDArray
 
 from submin.errors import StoreError
+from submin.network.id_hash import hash_ids as hash_ids  # by which the directory finds points
 
 AnyArray = NDArray[Any]
 
@@ -172,21 +173,3 @@ def set_rows(group: zarr.Group, column: str, rows: NDArray[np.int64], values: An
     """Change some rows of a column that is not text."""
     if len(rows):
         array_of(group, column).oindex[rows] = values
-
-
-_FNV_OFFSET, _FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
-
-
-def hash_ids(ids: NDArray[np.str_]) -> NDArray[np.uint64]:
-    """64-bit FNV-1a hash (n,) of the UTF-8 bytes of each id (Fowler, Noll, Vo)."""
-    if not len(ids):
-        return np.empty(0, dtype=np.uint64)
-    encoded = np.char.encode(ids, "utf-8")
-    width = max(encoded.dtype.itemsize, 1)
-    matrix = encoded.astype(f"S{width}").view(np.uint8).reshape(len(ids), width)
-    lengths = np.char.str_len(encoded)
-    value = np.full(len(ids), _FNV_OFFSET)
-    for k in range(width):  # over the letters of the longest id, all ids at once
-        live = lengths > k
-        value[live] = (value[live] ^ matrix[live, k].astype(np.uint64)) * _FNV_PRIME
-    return value

@@ -31,11 +31,12 @@ from submin.formats.columns import (
     read_table,
     refuse,
     required_path,
-    table_batches,
     table_path,
+    table_runs,
     text,
     text_values,
 )
+from submin.network.observations import Cluster
 from submin.sensors import SENSORS, SURVEYS
 from submin.storage.catalogue_schema import (
     CONTROL_PREFIX,
@@ -48,6 +49,8 @@ from submin.storage.catalogue_schema import (
     PointTable,
     defects,
 )
+from submin.storage.observation_table import STEM as OBSERVATIONS
+from submin.storage.observation_table import read_clusters
 from submin.storage.point_table import Covariances, read_point_table
 
 T = TypeVar("T")
@@ -67,13 +70,13 @@ _COVARIANCE_OF: dict[Literal["control", "check", "truth"], Covariances] = {"cont
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """A catalogue on disk: images and priors in memory, measurements read as they are needed.
+    """A catalogue on disk: images and priors in memory, measurements and other observations read as they are needed.
 
     Attributes
     ----------
     path : its folder
     metadata : body, ellipsoid, frame
-    images : all images, in catalogue order
+    images : all images, in catalogue order; none in a catalogue of other observations or of control alone
     default_prior : a priori model of blocks without an entry of their own
     priors : a priori model by block
     """
@@ -99,8 +102,10 @@ class Catalogue:
         if not folder.is_dir():
             raise CatalogueError(f"{folder}: no such folder; expected a catalogue (a folder with catalogue.json)")
         metadata = _from_json(folder / "catalogue.json", CatalogueMetadata.from_mapping)
-        images = _read_images(required_path(folder, "images"))
-        required_path(folder, "measurements")
+        images: tuple[ImageRecord, ...] = ()
+        if _needs_images(folder):
+            images = _read_images(required_path(folder, "images"))
+            required_path(folder, "measurements")
         default, priors = APriori(), dict[str, APriori]()
         if (folder / "priors.json").exists():
             default, priors = _from_json(folder / "priors.json", _priors)
@@ -140,6 +145,8 @@ class Catalogue:
         CatalogueError
             When a block comes back after another one, or a measurement names an image that is not of its block.
         """
+        if not self.images:
+            return
         path = required_path(self.path, "measurements")
         measured = set()
         for block_id, row, table in _runs(path):
@@ -152,6 +159,8 @@ class Catalogue:
 
     def block(self, block_id: str) -> Block:
         """One block; raises `CatalogueError` for an unknown one."""
+        if not self.images:
+            raise CatalogueError(f"{self.path}: no block {block_id!r}; the catalogue has no images")
         if block_id not in self._images_of:
             few, more = self.block_ids[:5], self.block_count - 5
             names = "one of " * (self.block_count > 1) + ", ".join(few) + (f" and {more:,} more" if more > 0 else "")
@@ -169,6 +178,19 @@ class Catalogue:
         path = table_path(self.path, kind)
         return None if path is None else read_point_table(path, _COVARIANCE_OF[kind])
 
+    def observations(self) -> Iterator[Cluster]:
+        """The clusters of positions and baselines, in the order of their table; none when the catalogue has no such table.
+
+        Memory is bounded by one cluster and a few rows of another.
+
+        Raises
+        ------
+        CatalogueError
+            When a cluster cannot be used, or has the id of a block of images: file, row, value, what was expected.
+        """
+        path = table_path(self.path, OBSERVATIONS)
+        return iter(()) if path is None else read_clusters(path, self.metadata.ellipsoid, frozenset(self.block_ids))
+
     def validate(self) -> CatalogueSummary:
         """Scan the whole catalogue for structural errors.
 
@@ -177,6 +199,14 @@ class Catalogue:
         CatalogueError
             The first one: file, row, value, what was expected.
         """
+        rays = self._validate_images() if self.images else 0
+        for kind in _COVARIANCE_OF:
+            self.points(kind)
+        sizes = [len(cluster) for cluster in self.observations()]
+        return CatalogueSummary(self.block_count, len(self.images), rays, len(sizes), sum(sizes))
+
+    def _validate_images(self) -> int:
+        """Scan images and measurements; the number of rays."""
         path = required_path(self.path, "images")
         for row, image in enumerate(self.images, start=1):
             try:
@@ -189,9 +219,7 @@ class Catalogue:
         rays = sum(len(self._image_index(block_id, row, table, path)) for block_id, row, table in _runs(path))
         if not rays:
             raise CatalogueError(f"{path}: holds no measurements; expected at least one row")
-        for kind in _COVARIANCE_OF:
-            self.points(kind)
-        return CatalogueSummary(self.block_count, len(self.images), rays)
+        return rays
 
     def _image_index(self, block_id: str, row: int, table: pa.Table, path: Path) -> NDArray[np.int32]:
         """Index of each ray's image among the images of its block; ``row`` is the number of the table's first row in its file."""
@@ -224,6 +252,12 @@ class Catalogue:
         )
 
 
+def _needs_images(folder: Path) -> bool:
+    """Whether a catalogue must have images: unless it has other observations or control, and no table that goes with images."""
+    others = any(table_path(folder, stem) for stem in (OBSERVATIONS, "control"))
+    return not others or any(table_path(folder, stem) for stem in ("images", "measurements"))
+
+
 def read_footprint(footprint: bytes, name: str) -> BaseGeometry:
     """The polygon of a footprint that ``name`` names in errors; raises `CatalogueError` when it is not WKB."""
     try:
@@ -234,25 +268,7 @@ def read_footprint(footprint: bytes, name: str) -> BaseGeometry:
 
 def _runs(path: Path) -> Iterator[tuple[str, int, pa.Table]]:
     """The rows of each block of a measurements table, with the number of their first row; a block that comes back is refused."""
-    seen: set[str] = set()
-    current, first_row, pieces = "", 1, list[pa.RecordBatch]()
-    for row, batch in table_batches(path, MEASUREMENT_COLUMNS):
-        runs = pc.run_end_encode(batch["block_id"])
-        start = 0
-        for block_id, stop in zip(runs.values.to_pylist(), runs.run_ends.to_pylist(), strict=True):
-            if block_id != current:
-                if pieces:
-                    yield current, first_row, pa.Table.from_batches(pieces)
-                if block_id in seen:
-                    raise CatalogueError(
-                        f"{path}: row {row + start}: block_id {block_id!r} comes back after {current!r}; expected rows sorted by block"
-                    )
-                seen.add(block_id)
-                current, first_row, pieces = block_id, row + start, []
-            pieces.append(batch.slice(start, stop - start))
-            start = stop
-    if pieces:
-        yield current, first_row, pa.Table.from_batches(pieces)
+    return table_runs(path, MEASUREMENT_COLUMNS, "block_id", "block")
 
 
 def _from_json(path: Path, parse: Callable[[Mapping[str, Any]], T]) -> T:

@@ -399,11 +399,13 @@ class PointTable:
 
 @dataclass(frozen=True)
 class CatalogueSummary:
-    """Sizes of a catalogue that was found free of structural errors."""
+    """Sizes of a catalogue that was found free of structural errors; ``clusters`` are those of ``observations`` without images."""
 
     blocks: int
     images: int
     rays: int
+    clusters: int = 0
+    observations: int = 0
 
 
 __all__ = [

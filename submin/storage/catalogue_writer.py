@@ -11,20 +11,24 @@ from types import TracebackType
 from typing import Literal, Self
 from uuid import uuid4
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError
 from submin.formats.columns import Column
-from submin.formats.tables import covariance_rows
+from submin.network.observations import Cluster
 from submin.storage.catalogue import IMAGE_COLUMNS, MEASUREMENT_COLUMNS
-from submin.storage.catalogue_schema import COVARIANCE_COLUMNS, POINT_KINDS, Block, CatalogueMetadata, ImageRecord, PointTable
+from submin.storage.catalogue_schema import POINT_KINDS, Block, CatalogueMetadata, ImageRecord, PointTable
+from submin.storage.observation_table import OBSERVATION_COLUMNS, cluster_tables
+from submin.storage.observation_table import STEM as OBSERVATIONS
+from submin.storage.point_table import point_columns
 
 GROUP_ROWS = 1 << 17
 """Measurements in a row group of the Parquet file: a few MB, so that a reader needs little memory and few groups hold one block."""
 _IMAGES_AT_ONCE = 1 << 12
+_GROUP_VALUES = 1 << 20
+"""Values of covariances after which a row group of observations is written: 8 MiB."""
 
 
 def _schema(columns: Iterable[Column]) -> pa.Schema:
@@ -62,6 +66,11 @@ class CatalogueWriter:
         self._written: set[str] = set()
         self._pending: list[pa.Table] = []
         self._pending_rows = 0
+        self._clusters: set[str] = set()
+        self._observations: pq.ParquetWriter | None = None
+        self._waiting: list[pa.Table] = []
+        self._without_images = True
+        self._others = False
         self._images: pq.ParquetWriter | None = None
         self._measurements: pq.ParquetWriter | None = None
 
@@ -83,9 +92,14 @@ class CatalogueWriter:
             images, measurements = self._open()
             if kind is None:
                 self._flush()
-            images.close()
-            measurements.close()
+                self._flush_observations()
+            for writer in (images, measurements, self._observations):
+                if writer is not None:
+                    writer.close()
             if kind is None:
+                if self._without_images and self._others:
+                    for name in ("images", "measurements"):
+                        (self._folder / f"{name}.parquet").unlink()
                 self._take_place()
             elif isinstance(error, OSError):
                 raise self._unwritable(error) from error
@@ -98,6 +112,7 @@ class CatalogueWriter:
         """Append images; their order is the catalogue's."""
         writer, remaining = self._open()[0], iter(images)
         while chunk := list(islice(remaining, _IMAGES_AT_ONCE)):
+            self._without_images = False
             names = [c.name for c in IMAGE_COLUMNS]
             columns: dict[str, Sequence[object]] = {
                 name: [image.footprint or None for image in chunk] if name == "geometry" else [getattr(image, name) for image in chunk]
@@ -117,6 +132,7 @@ class CatalogueWriter:
         if block.block_id in self._written:
             raise CatalogueError(f"{self.path}: block {block.block_id!r} is written twice; expected all its rays at once")
         self._written.add(block.block_id)
+        self._without_images = False
         image_ids = pa.array([image.image_id for image in block.images], pa.string())
         columns = [
             pa.repeat(pa.scalar(block.block_id, pa.string()), len(block)), image_ids.take(pa.array(block.image)),
@@ -126,6 +142,24 @@ class CatalogueWriter:
         self._pending_rows += len(block)
         if self._pending_rows >= GROUP_ROWS:
             self._flush()
+
+    def write_observations(self, cluster: Cluster) -> None:
+        """Append a cluster of positions and baselines; a catalogue that gets no images then has no tables of images and measurements.
+
+        Raises
+        ------
+        CatalogueError
+            When the cluster was written before: a cluster stands in one place.
+        """
+        self._open()
+        if cluster.cluster_id in self._clusters:
+            raise CatalogueError(f"{self.path}: cluster {cluster.cluster_id!r} is written twice; expected all its observations at once")
+        self._clusters.add(cluster.cluster_id)
+        self._others = True
+        for part in cluster_tables(cluster):
+            self._waiting.append(part)
+            if sum(len(table["covariance_row"].combine_chunks().flatten()) for table in self._waiting) >= _GROUP_VALUES:
+                self._flush_observations()
 
     def write_priors(self, default: APriori, by_block: Mapping[str, APriori] | None = None) -> None:
         """Write ``priors.json``: the a priori model of all blocks, and of those that have their own."""
@@ -141,17 +175,10 @@ class CatalogueWriter:
         self._open()
         if kind not in POINT_KINDS:
             raise CatalogueError(f"kind of points is {kind!r}; expected one of {', '.join(POINT_KINDS)}")
-        columns = {
-            "point_id": pa.array(points.point_ids, pa.string()),
-            **{name: points.geodetic[:, k] for k, name in enumerate(("longitude", "latitude", "height"))},
-        }
-        if kind != "truth":
-            columns["area"] = pa.array(points.area, pa.string())
-            row, column = np.triu_indices(3)
-            columns |= {name: points.covariance_enu[:, i, j] for name, i, j in zip(COVARIANCE_COLUMNS, row, column, strict=True)}
-            if points.joint_covariance is not None:
-                columns["covariance_row"] = covariance_rows(points.joint_covariance, 0, len(points))
-        pq.write_table(pa.table(columns), self._folder / f"{kind}{suffix and '-' + suffix}.parquet", compression="zstd")
+        self._others |= kind == "control" and not suffix
+        pq.write_table(
+            point_columns(points, kind != "truth"), self._folder / f"{kind}{suffix and '-' + suffix}.parquet", compression="zstd"
+        )
 
     def _unwritable(self, cause: OSError) -> CatalogueError:
         return CatalogueError(
@@ -170,6 +197,17 @@ class CatalogueWriter:
         if self._pending:
             self._open()[1].write_table(pa.concat_tables(self._pending), row_group_size=2 * GROUP_ROWS)
         self._pending, self._pending_rows = [], 0
+
+    def _flush_observations(self) -> None:
+        if not self._waiting:
+            return
+        if self._observations is None:
+            schema = _schema(OBSERVATION_COLUMNS)
+            self._observations = pq.ParquetWriter(
+                self._folder / f"{OBSERVATIONS}.parquet", schema, compression="zstd", use_dictionary=["cluster", "kind"]
+            )
+        self._observations.write_table(pa.concat_tables(self._waiting))
+        self._waiting = []
 
     def _refuse_occupied(self) -> None:
         if self.path.exists() and not self.path.is_dir():

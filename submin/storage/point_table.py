@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from submin.errors import CatalogueError, InputError
 from submin.formats.columns import Column, column_names, number, number_values, read_table, refuse, text, text_values
-from submin.formats.tables import covariance_of_rows
+from submin.formats.replacing import replacing
+from submin.formats.tables import covariance_of_rows, covariance_rows
 from submin.geodesy import local_axes, rotate_covariance
 from submin.storage.catalogue_schema import COVARIANCE_COLUMNS, SIGMA_COLUMNS, PointTable, first_repeated
 
@@ -66,6 +68,38 @@ def read_point_table(path: str | Path, covariance: Covariances = "any") -> Point
         refuse(pa.array(~(np.abs(geodetic[:, k]) <= limit)), table[name], name, file, 1, expected)
     enu, joint = _covariances(table, file, geodetic, covariance)
     return PointTable(point_ids, geodetic, enu, text_values(table, "area"), joint)
+
+
+def point_columns(points: PointTable, covariance: bool = True) -> pa.Table:
+    """The columns of a table of points, as `read_point_table` reads them; without ``covariance`` the coordinates only."""
+    columns: dict[str, object] = {
+        "point_id": pa.array(points.point_ids, pa.string()),
+        **{name: points.geodetic[:, k] for k, name in enumerate(("longitude", "latitude", "height"))},
+    }
+    if covariance:
+        columns["area"] = pa.array(points.area, pa.string())
+        row, column = np.triu_indices(3)
+        columns |= {name: points.covariance_enu[:, i, j] for name, i, j in zip(COVARIANCE_COLUMNS, row, column, strict=True)}
+        if points.joint_covariance is not None:
+            columns["covariance_row"] = covariance_rows(points.joint_covariance, 0, len(points))
+    return pa.table(columns)
+
+
+def write_point_table(path: str | Path, points: PointTable, metadata: Mapping[str, str]) -> None:
+    """Write points as a Parquet file of their own, with texts that say where they come from; nothing that is there is written over.
+
+    Raises
+    ------
+    InputError
+        When the name does not end in ``.parquet``, something is there already, or it cannot be written.
+    """
+    file = Path(path)
+    if file.suffix != ".parquet":
+        raise InputError(f"{file}: unknown suffix {file.suffix!r}; expected .parquet")
+    if file.exists():
+        raise InputError(f"{file}: already exists; choose another place, or remove it first")
+    with replacing(file) as temporary:
+        pq.write_table(point_columns(points).replace_schema_metadata(dict(metadata)), temporary, compression="zstd")
 
 
 def _refuse_derived(path: Path) -> None:
@@ -135,4 +169,4 @@ def _joint_covariance(table: pa.Table, path: Path) -> Array:
         raise CatalogueError(str(error)) from None
 
 
-__all__ = ["POINT_COLUMNS", "Covariances", "PointTable", "read_point_table"]
+__all__ = ["POINT_COLUMNS", "Covariances", "PointTable", "point_columns", "read_point_table", "write_point_table"]

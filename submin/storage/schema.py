@@ -55,6 +55,7 @@ class NetworkMetadata:
     parameters : adjustable parameters kept for each image; later versions may keep more, when a sensor comes that has them
     max_parameters : a tile that would hold more image parameters is split, where its overlap lets it
     format_version : of the store
+    thinning : side in metres of the squares of which one point each is reported; 0 reports every point (decision 013)
     """
 
     name: str
@@ -68,6 +69,7 @@ class NetworkMetadata:
     parameters: int = 6
     max_parameters: int = 2500
     format_version: int = FORMAT_VERSION
+    thinning: float = 0.0
 
     @property
     def ellipsoid(self) -> Ellipsoid:

@@ -9,6 +9,9 @@ interior, four edges, four corners (docs/mathematics.md, "Cells").
 Tiles are named ``r003c007`` (row from the south, column from the west), quarters of a split core ``r003c007q0`` to ``q3`` (south-west,
 south-east, north-west, north-east), their quarters ``r003c007q02``. A cell is named by the tiles that hold it, its owner first:
 ``r003c007+r003c008``.
+
+The area itself may be any polygon. Cores tile all of its bounding rectangle, but only tiles whose outline meets the area are counted as
+tiles of the cover; the others come to be when a position outside the area falls to them.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
+from shapely.geometry.polygon import orient
 
 from submin.errors import InputError
 from submin.geodesy import WGS84, Ellipsoid
@@ -32,6 +36,10 @@ Array = NDArray[np.float64]
 Codes = NDArray[np.int64]
 
 MAX_TILES = 1_000_000
+MAX_OUTLINE = 10_000
+"""Corners of an area's outline that a cover keeps, at most; it travels with the cover, and tiles need no finer one."""
+STEP_DEGREES = 0.25
+"""An edge that is straight in longitude and latitude bends in the plane: by 30 m from one corner to the next at 70 degrees north."""
 MAX_LEVEL = 12
 """A core may be halved so often: to a four-thousandth of its side."""
 ZONES = 5
@@ -54,6 +62,7 @@ class Cover:
     overlap : width that two neighbours share, metres, half on each side of the border of their cores
     ellipsoid : of the body
     splits : tiles that were split into four, ascending; a tile that is listed here is none any more
+    area : the area in the plane, metres, as WKB; empty when it is the rectangle of the cores
 
     Raises
     ------
@@ -69,6 +78,7 @@ class Cover:
     overlap: float
     ellipsoid: Ellipsoid = WGS84
     splits: tuple[int, ...] = ()
+    area: bytes = b""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.core) and self.core > 0.0):
@@ -173,10 +183,36 @@ class Cover:
         return self._zone_memory[tile]
 
     def outside(self, longitude: Array, latitude: Array) -> NDArray[np.bool_]:
-        """True (n,) for positions outside the rectangle of the cores."""
+        """True (n,) for positions outside the cores of all tiles of the cover; the nearest core owns them."""
         east, north = self.plane(longitude, latitude)
         x, y = (east - self.origin[0]) / self.core, (north - self.origin[1]) / self.core
-        return np.asarray((x < 0) | (y < 0) | (x >= self.columns) | (y >= self.rows))
+        beyond = np.asarray((x < 0) | (y < 0) | (x >= self.columns) | (y >= self.rows))
+        if self.area:
+            owners, of = np.unique(self._leaves_at(east, north)[0], return_inverse=True)
+            beyond |= ~self.meets_area(owners)[of]
+        return beyond
+
+    def outside_area(self, longitude: Array, latitude: Array) -> NDArray[np.bool_]:
+        """True (n,) for positions outside the area itself."""
+        if not self.area:
+            return self.outside(longitude, latitude)
+        return np.asarray(~shapely.intersects_xy(self._shape, *self.plane(longitude, latitude)))
+
+    @cached_property
+    def _shape(self) -> BaseGeometry:
+        shape = shapely.from_wkb(self.area)
+        shapely.prepare(shape)
+        return shape
+
+    def meets_area(self, tiles: Codes) -> NDArray[np.bool_]:
+        """True (n,) for tiles of the cover: their outline meets the area."""
+        if not self.area or not len(tiles):
+            return np.ones(len(tiles), dtype=np.bool_)
+        level, row, column = np.array([self._address(tile) for tile in tiles.tolist()]).T
+        side, half = self.core / 2.0**level, 0.5 * self.overlap
+        west, south = self.origin[0] + column * side, self.origin[1] + row * side
+        outlines = shapely.box(west - half, south - half, west + side + half, south + side + half)
+        return np.asarray(shapely.intersects(self._shape, outlines))
 
     def holders(self, cell: int) -> tuple[int, ...]:
         """Tiles that hold a cell, ascending; the cell's owner among them."""
@@ -293,7 +329,7 @@ class Cover:
 
     def depth(self, tile: int, longitude: Array, latitude: Array) -> Array:
         """Distance (n,) in metres from positions to the tile's outline, positive inside; rim sides are infinitely far."""
-        west, south, east, north = self._bounds(tile, 0.5 * self.overlap, open_rim=True)
+        west, south, east, north = self.tile_bounds(tile)
         x, y = self.plane(longitude, latitude)
         return np.asarray(np.minimum.reduce([x - west, east - x, y - south, north - y]))
 
@@ -313,6 +349,10 @@ class Cover:
         """West, south, east, north of a core in the plane, metres; cores on the rim reach to infinity."""
         return self._bounds(tile, 0.0, open_rim=True)
 
+    def tile_bounds(self, tile: int) -> tuple[float, float, float, float]:
+        """West, south, east, north of a tile in the plane, metres; tiles on the rim reach to infinity."""
+        return self._bounds(tile, 0.5 * self.overlap, open_rim=True)
+
     def core_outline(self, tile: int) -> Array:
         """Outline (5, 2) of a core in the plane, metres, closed."""
         return _ring(*self._bounds(tile, 0.0))
@@ -322,10 +362,15 @@ class Cover:
         return _ring(*self._bounds(tile, 0.5 * self.overlap))
 
     def tiles(self) -> Iterator[int]:
-        """All tiles, those of one core together."""
+        """Tiles whose outline meets the area, those of one core together."""
+        return iter(self._of_area.tolist()) if self.area else self.leaves()
+
+    def leaves(self) -> Iterator[int]:
+        """Tiles of all cores, those whose outline does not meet the area too."""
+        split = set(self.splits)
 
         def leaves(tile: int) -> Iterator[int]:
-            if tile not in self.splits:
+            if tile not in split:
                 yield tile
             else:
                 for quarter in self.quarters(tile):
@@ -333,10 +378,15 @@ class Cover:
 
         return (leaf for tile in range(self._base) for leaf in leaves(tile))
 
+    @cached_property
+    def _of_area(self) -> Codes:
+        every = np.fromiter(self.leaves(), dtype=np.int64)
+        return every[self.meets_area(every)]
+
     @property
     def tile_count(self) -> int:
-        """Number of tiles."""
-        return self._base + 3 * len(self.splits)
+        """Number of tiles whose outline meets the area."""
+        return len(self._of_area) if self.area else self._base + 3 * len(self.splits)
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values that describe the cover."""
@@ -351,7 +401,7 @@ class Cover:
             "semimajor_axis": self.ellipsoid.semimajor_axis,
             "flattening": self.ellipsoid.flattening,
             "splits": list(self.splits),
-        }
+        } | ({"area": self.area.hex()} if self.area else {})
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Cover:
@@ -360,6 +410,7 @@ class Cover:
             (values["centre"][0], values["centre"][1]), (values["origin"][0], values["origin"][1]),
             values["rows"], values["columns"], values["core"], values["overlap"],
             Ellipsoid(values["semimajor_axis"], values["flattening"]), tuple(values["splits"]),
+            bytes.fromhex(values.get("area", "")),
         )  # fmt: skip
 
 
@@ -370,33 +421,81 @@ def _ring(west: float, south: float, east: float, north: float) -> Array:
 def cover_area(area: BaseGeometry, core: float, overlap: float, ellipsoid: Ellipsoid = WGS84) -> Cover:
     """The smallest grid of cores over an area, its middle in the middle.
 
+    The frame is centred on the centroid of the area on the sphere, or on the middle of a box in longitude and latitude that is not
+    wider than a right angle and touches no pole. The cover keeps the area unless it is a box that every tile meets.
+
     Parameters
     ----------
-    area : polygon or polygons in longitude and latitude, degrees
+    area : polygon or polygons in longitude and latitude, degrees; across the antimeridian cut there, or with longitudes beyond 180
     core, overlap : metres
 
     Raises
     ------
     InputError
-        When the area is empty, crosses itself, or has coordinates that cannot be longitudes and latitudes.
+        When the area is empty, crosses itself, or has coordinates that cannot be longitudes and latitudes; or when it holds the place
+        opposite its centroid, or has none.
     """
     if not area.is_valid:
         raise InputError(f"the area is not a valid polygon: {shapely.is_valid_reason(area)}; mend it and try again")
     check_on_globe(area)
     area = _unwrapped(area)
-    west, south, east, north = area.bounds
-    centre = (0.5 * (west + east), 0.5 * (south + north))
+    centre = _centre(area)
     frame = Cover(centre, (0.0, 0.0), 1, 1, core, overlap, ellipsoid)
-    outline = shapely.get_coordinates(shapely.segmentize(area, max(0.01 * max(east - west, north - south), 1e-9)))
+    west, south, east, north = area.bounds
+    fine = shapely.segmentize(area, min(max(0.01 * max(east - west, north - south), 1e-9), STEP_DEGREES))
+    outline = shapely.get_coordinates(fine)
     x, y = frame.plane(outline[:, 0], outline[:, 1])
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+    opposite = centre[0] + 180.0 + np.array([-720.0, -360.0, 0.0, 360.0])
+    if not (np.isfinite(x).all() and np.isfinite(y).all()) or shapely.intersects_xy(area, opposite, -centre[1]).any():
         raise InputError(
             "the area reaches to the point opposite its middle, where no equal-area plane reaches; take less than a hemisphere"
         )
     # A touch of tolerance: an area of exactly three cores is three cores, not four.
     columns, rows = (max(int(np.ceil(min(float(np.ptp(v)) / core, 1e12) - 1e-3)), 1) for v in (x, y))
     origin = (0.5 * (x.max() + x.min()) - 0.5 * columns * core, 0.5 * (y.max() + y.min()) - 0.5 * rows * core)
-    return Cover(centre, origin, rows, columns, core, overlap, ellipsoid)
+    grid = Cover(centre, origin, rows, columns, core, overlap, ellipsoid)
+    shape = _in_plane(fine, grid)
+    cover = grid if shape.is_empty else replace(grid, area=shapely.to_wkb(shape))
+    return grid if _is_box(area) and cover.tile_count == grid.tile_count else cover
+
+
+def polygons_of(shape: BaseGeometry) -> BaseGeometry:
+    """The polygons of a shape, without its lines and points."""
+    parts = shapely.get_parts(shapely.get_parts(shape))  # a collection may hold polygons in parts
+    return shapely.multipolygons([part for part in parts if part.geom_type == "Polygon"])
+
+
+def _is_box(area: BaseGeometry) -> bool:
+    return bool(area.equals(shapely.box(*area.bounds)))
+
+
+def _centre(area: BaseGeometry) -> tuple[float, float]:
+    """Longitude and latitude of the middle of an area; raises `InputError` for one that has none, such as the whole globe."""
+    west, south, east, north = area.bounds
+    if _is_box(area) and east - west <= 90.0 and south > -90.0 and north < 90.0:
+        return 0.5 * (west + east), 0.5 * (south + north)
+    # twice the integral of the unit normal over an area on the sphere is that of r x dr around it, with the area on the left
+    parts = [orient(part) for part in shapely.get_parts(shapely.segmentize(area, STEP_DEGREES))]
+    rings = [ring for part in parts for ring in (part.exterior, *part.interiors)]
+    total = np.zeros(3)
+    for ring in rings:
+        lon, lat = np.radians(shapely.get_coordinates(ring)).T
+        r = np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        total += np.cross(r[:-1], np.diff(r, axis=0)).sum(axis=0)
+    if np.linalg.norm(total) < 1e-12:
+        raise InputError("the area has no middle on the globe; take less than a hemisphere")
+    return float(np.degrees(np.arctan2(total[1], total[0]))), float(np.degrees(np.arctan2(total[2], np.hypot(total[0], total[1]))))
+
+
+def _in_plane(area: BaseGeometry, cover: Cover) -> BaseGeometry:
+    """An area in longitude and latitude, with corners enough, in the plane of a cover: one piece across the antimeridian and the poles."""
+    flat = shapely.transform(shapely.get_parts(area), lambda at: np.column_stack(cover.plane(at[:, 0], at[:, 1])))
+    # what ends at a pole or at the antimeridian has edges on both sides of one line: snapped to a centimetre, they go
+    shape, tolerance = polygons_of(shapely.union_all(shapely.make_valid(flat), grid_size=0.01)), 1e-3 * cover.core
+    while shapely.get_num_coordinates(shape) > MAX_OUTLINE:
+        # widened first: the simpler area holds all of the finer one
+        shape, tolerance = shapely.simplify(shapely.buffer(shape, tolerance, join_style="mitre"), tolerance), 2.0 * tolerance
+    return shape
 
 
 def check_on_globe(area: BaseGeometry) -> None:

@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import icechunk
 import numpy as np
@@ -25,9 +26,11 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 import zarr
+from gnss_files import MEASUREMENTS, dna_lines, simulated
 from isis_files import binary, isd, points
 from isis_files import write as write_isis
 from networks import accepted_rays, area_of
+from sinex_files import sinex_lines, station_parameters
 
 import submin
 from orchestration.adjust import adjust, write
@@ -213,6 +216,28 @@ class World:
         words = self.isis()
         self.write("isis/image0.isd", json.dumps(isd(0, **changes)))
         return words
+
+    def gnss(self, old: str = "", new: str = "", lines: list[str] | None = None) -> list[Any]:
+        """An import of GNSS measurements, a text of which is replaced."""
+        file = self.write("survey.msr", "\n".join(dna_lines() if lines is None else lines) + "\n")
+        if old:
+            self.replace("survey.msr", old, new)
+        return ["import", "gnss", file, "--out", self.new]
+
+    def sinex(self, old: str = "", new: str = "", **file: Any) -> list[Any]:
+        """An import of a solution of two stations, a text of which is replaced."""
+        places = np.array([-4052052.7, 4212835.9, -2545104.5, -2713833.4, 5303935.0, -2269515.1])
+        covariance = 1e-6 * (np.eye(6) + 0.5)
+        path = self.write("solution.snx", "\n".join(sinex_lines(station_parameters(2), places, covariance, **file)) + "\n")
+        if old:
+            self.replace("solution.snx", old, new)
+        return ["import", "sinex", path, "--out", self.folder / "control.parquet"]
+
+    def observed(self, **columns: Any) -> list[Any]:
+        """A run of a catalogue that also has observations, some columns of which are changed."""
+        rows = {"cluster": ["gnss"], "kind": ["position"], "from": ["A"], "to": [""], "x": [-1.1e6], "y": [5.1e6], "z": [3.6e6]}
+        pq.write_table(pa.table(rows | {"covariance_row": [np.eye(3).ravel().tolist()]} | columns), self.catalogue / "observations.parquet")
+        return self.run()
 
     def replace(self, name: str, old: str, new: str) -> None:
         path = self.folder / name
@@ -400,9 +425,12 @@ simply("area with swapped axes", lambda w: w.area([[y, x] for x, y in RING]))
 simply("area off the globe", lambda w: w.area([[x, y + 100] for x, y in RING]))
 simply("area with a coordinate that is not finite", lambda w: w.area([[99, float("nan")], *RING[1:]]))
 simply("overlap as wide as the core", lambda w: ["create", w.new, *BOX, "--tile-km", 50, "--overlap-km", 50])
+simply("overlap wider than the core", lambda w: ["create", w.new, *BOX, "--tile-km", 50, "--overlap-km", 75])
 simply("negative overlap", lambda w: ["create", w.new, *BOX, "--overlap-km", -1])
 simply("tiles without size", lambda w: ["create", w.new, *BOX, "--tile-km", 0])
 simply("a billion tiles", lambda w: ["create", w.new, "--bbox", -170, -60, 170, 60, "--tile-km", 0.3, "--overlap-km", 0.1])
+simply("ten million tiles", lambda w: [*w.area([[100, 0], [110, 0], [110, 10], [100, 10], [100, 0]]), "--tile-km", 0.347])
+simply("area around the globe", lambda w: ["create", w.new, "--bbox", -180, -60, 180, 60])
 simply("tiles too small to count", lambda w: ["create", w.new, *BOX, "--tile-km", 1e-307, "--overlap-km", 0])
 
 
@@ -424,7 +452,8 @@ def _(w: World) -> list[Any]:
 def _(w: World) -> list[Any]:
     columns = w.columns("images")
     del columns["geometry"]
-    w.put("images", columns)
+    blind = [json.dumps(json.loads(camera) | {"LINE_NUM_COEFF": [0.0] * 20}) for camera in columns["camera"]]
+    w.put("images", columns | {"camera": blind})
     return ["create", w.new, "--fit", w.catalogue]
 
 
@@ -780,6 +809,36 @@ def _(w: World) -> list[Any]:
     return ["map", w.fused, "--out", w.folder / "map.png"]
 
 
+# --- export -----------------------------------------------------------------------------------------------------------------------------
+
+
+def export(w: World, *words: Any, out: str = "compact.parquet", family: str = "exponential") -> list[Any]:
+    return ["export", w.fused, "--out", w.folder / out, "--family", family, *words]
+
+
+simply("unknown family of correlation functions", lambda w: export(w, family="sinc"))
+simply("correlation function that is indefinite in the plane", lambda w: export(w, family="tent"))
+simply("floor of a family that has none", lambda w: export(w, "--floor-km", 50))
+simply("floor that is not positive", lambda w: export(w, "--floor-km", 0))
+simply("more vectors than coordinates", lambda w: export(w, "--rank", 1000))
+simply("negative number of vectors", lambda w: export(w, "--rank", -1))
+simply("no points to condense", lambda w: export(w, "--bbox", 99, 34, 99.001, 34.001))
+simply("export of unknown format", lambda w: export(w, out="compact.csv"))
+simply("export to a folder that does not exist", lambda w: export(w, out="nowhere/compact.parquet"))
+
+
+@case("too many points to condense")
+def _(w: World) -> list[Any]:
+    w.around = lambda: mock.patch("submin.correlation.compact.MOST_POINTS", 10)
+    return export(w)
+
+
+@case("export as control")
+def _(w: World) -> list[Any]:
+    submin.open(w.fused).export(w.folder / "compact.parquet", family="exponential", max_points=9)
+    return ["control", "add", w.fused, w.folder / "compact.parquet"]
+
+
 # --- withdrawal, control and tags -------------------------------------------------------------------------------------------------------
 
 HEADER = "point_id,longitude,latitude,height"
@@ -804,6 +863,31 @@ simply("added control with a sigma of zero", lambda w: surveyed(w, f"{HEADER},si
 simply("tag that is taken", lambda w: ["tag", w.tagged(), "mine"])
 simply("tag like a version", lambda w: ["tag", w.fused, "v1"])
 simply("difference to an unknown version", lambda w: ["diff", w.fused, "v0", "v8"])
+
+# --- points: metadata, thinning, dates --------------------------------------------------------------------------------------------------
+
+
+def listing(w: World, *words: Any, out: str = "points.csv") -> list[Any]:
+    return ["points", w.fused, *words, "--out", w.folder / out]
+
+
+def retiring(w: World, *words: Any, ids: str = "P000000\n") -> list[Any]:
+    return ["retire", w.fused, "--points", w.write("ids.txt", ids), *words]
+
+
+simply("thinning to squares without a side", lambda w: ["create", w.new, *BOX, "--thin-metres", 0])
+simply("details of an answer that is not written", lambda w: ["query", w.fused, *BOX, "--details"])
+simply("query on a day that is none", lambda w: ["query", w.fused, *BOX, "--on", "31.5.2026"])
+simply("metadata of no points", lambda w: listing(w))
+simply("metadata asked for in two ways", lambda w: listing(w, *BOX, "--tile", "r000c000"))
+simply("metadata of unknown points", lambda w: listing(w, "--points", w.write("ids.txt", "P000000\nP1\n")))
+simply("metadata of an unknown status", lambda w: listing(w, *BOX, "--status", "good"))
+simply("metadata of unknown format", lambda w: listing(w, *BOX, out="points.npz"))
+simply("metadata to a folder that does not exist", lambda w: listing(w, *BOX, out="nowhere/points.csv"))
+simply("retirement of unknown points", lambda w: retiring(w, "--valid-to", "2026-05-31", ids="P000000\nP1\n"))
+simply("retirement on a day that is none", lambda w: retiring(w, "--valid-to", "2026-02-30"))
+simply("retirement without a day", lambda w: retiring(w, "--reason", "quarry"))
+simply("retirement before the first day", lambda w: retiring(w, "--valid-from", "2026-06-01", "--valid-to", "2026-05-31"))
 
 
 def _correlated(w: World, covariance: Any, variance: float = 1.0) -> list[Any]:
@@ -1117,6 +1201,73 @@ def test_the_page_and_the_cases_are_the_same() -> None:
 def test_each_case(name: str, world: World, call: Call) -> None:
     words, row = CASES[name](world), ROWS[name]
     (refused if row.code == 2 else rejected_alone)(world, words, row, call)
+
+
+# --- GNSS files, solutions, observations ------------------------------------------------------------------------------------------------
+
+simply("GNSS file of another format", lambda w: ["import", "gnss", w.write("survey.txt", "G A B"), "--out", w.new])
+simply("no such GNSS file", lambda w: ["import", "gnss", w.folder / "survey.msr", "--out", w.new])
+simply("GNSS file cut short", lambda w: w.gnss(lines=dna_lines()[:5]))
+simply("GNSS measurement of another type", lambda w: w.gnss("G A ", "S A "))
+simply("GNSS positions that are not XYZ", lambda w: w.gnss("XYZ", "LLH"))
+simply("GNSS scale by direction", lambda w: w.gnss("10.00      1.00", "10.00      1.50"))
+simply("GNSS covariance with too few numbers", lambda w: w.gnss(lines=[line[:102] for line in dna_lines()]))
+simply("GNSS positions of another epoch", lambda w: [*w.gnss(), "--epoch", "2021-01-01"])
+simply("GNSS file whose measurements are all left out", lambda w: w.gnss(lines=dna_lines((MEASUREMENTS[1],))))
+
+
+@case("GNSS covariance that is none")
+def _(w: World) -> list[Any]:
+    flat = simulated("G", (("A", "B"),), 1)
+    flat.covariance[1] = flat.covariance[:, 1] = flat.covariance[0]
+    return w.gnss(lines=dna_lines((flat,)))
+
+
+def replacing_values(w: World, value: float, rows: int = 3) -> list[Any]:
+    lines = [f"0,G,A,B,{axis},{value if value else v:.4f},{v:.4f}" for axis, v in zip("XYZ", MEASUREMENTS[0].values[0], strict=True)]
+    table = w.write("values.csv", "\n".join(["cluster,type,from,to,component,file,new", *lines[:rows], ""]))
+    return [*w.gnss(lines=dna_lines(MEASUREMENTS[:1])), "--values", table]
+
+
+simply("values that are of another measurement", lambda w: replacing_values(w, 1.0))
+simply("values that leave one out", lambda w: replacing_values(w, 0.0, rows=2))
+simply("SINEX file cut short", lambda w: w.sinex("-SOLUTION/MATRIX_ESTIMATE L COVA\n%ENDSNX\n", ""))
+simply("file that is not SINEX", lambda w: w.sinex("%=SNX", "%=BIA"))
+
+
+@case("SINEX file without a matrix")
+def _(w: World) -> list[Any]:
+    words = w.sinex()
+    for _ in ("begin", "end"):
+        w.replace("solution.snx", "SOLUTION/MATRIX_ESTIMATE", "SOLUTION/MATRIX_OF_OURS")
+    return words
+
+
+simply("SINEX matrix that is no covariance", lambda w: w.sinex(" 5.00000000000000E-07", " 5.00000000000000E-01"))
+simply("SINEX line with a word too many", lambda w: w.sinex(" 5.00000000000000E-07", " 5.0E-07 5.0E-07 5.0E-07 5.0E-07"))
+simply("SINEX coordinates of an unknown station", lambda w: w.sinex(" S001  A 5", " S009  A 5"))
+simply("SINEX coordinates at two epochs", lambda w: w.sinex("STAX   S001  A    1 17:298", "STAX   S001  A    1 16:298"))
+simply("SINEX solution with a constraint that is not in the file", lambda w: w.sinex(code="0"))
+simply("SINEX solution that its constraint alone holds", lambda w: w.sinex(a_priori=(np.zeros(6), 1e-6 * (np.eye(6) + 0.5))))
+simply("SINEX solution of another epoch", lambda w: [*w.sinex(), "--epoch", "2020"])
+simply("GNSS file as control with baselines in it", lambda w: ["import", "sinex", w.gnss()[2], "--out", w.folder / "control.parquet"])
+
+
+@case("control made where something is")
+def _(w: World) -> list[Any]:
+    w.write("control.parquet", "mine")
+    return w.sinex()
+
+
+simply("control made as CSV", lambda w: [*w.sinex()[:4], w.folder / "control.csv"])
+simply("observation of another kind", lambda w: w.observed(kind=["angle"]))
+simply("position with an end", lambda w: w.observed(to=["B"]))
+simply("baseline without an end", lambda w: w.observed(kind=["baseline"]))
+simply("position in degrees", lambda w: w.observed(x=[100.0], y=[35.0], z=[900.0]))
+simply("observation that is not a number", lambda w: w.observed(x=[float("nan")]))
+simply("observation whose covariance is short", lambda w: w.observed(covariance_row=[[1.0] * 3]))
+simply("observation without an error of its own", lambda w: w.observed(covariance_row=[[1.0] * 9]))
+simply("cluster with the id of a block of images", lambda w: w.observed(cluster=[w.block()]))
 
 
 def refused(world: World, words: list[Any], row: Row, call: Call) -> None:

@@ -200,6 +200,45 @@ def intersected(problem: Equations, tiles: Sequence[int], weights: Array) -> Arr
     return weighted_sum([information(problem, problem.held([tile])) for tile in tiles], weights)
 
 
+def inflated(problem: Equations, tiles: Sequence[int], scale: Array) -> Array:
+    """Map to the images by the tiles' own adjustments, each with its covariance times a scale, fused as if they were independent."""
+    return weighted_sum([information(problem, problem.held([tile])) for tile in tiles], 1.0 / np.asarray(scale))
+
+
+def split(problem: Equations, tiles: Sequence[int], weights: Array) -> Array:
+    """Map to the images by split intersection: of each tile only what comes from cells and priors of several tiles is inflated."""
+    held = [problem.held([tile]) for tile in tiles]
+    holders: dict[tuple[bool, ...], list[int]] = {}
+    for cell in np.unique(np.concatenate(held)).tolist():
+        holders.setdefault(tuple(cell in of_tile for of_tile in held), []).append(cell)
+    q = problem.whitened
+    whole, right = np.zeros((q, q)), np.zeros((q, len(problem.data)))
+    for t, of_tile in enumerate(held):
+        own = information(problem, of_tile)
+        mine = own.root.T @ own.root
+        spread = np.eye(q) * np.sum(weights) / weights[t]
+        for who, cells in holders.items():
+            if who[t]:
+                part = information(problem, np.array(cells))
+                spread += (part.root.T @ part.root - np.eye(q)) * np.sum(np.asarray(weights)[list(who)]) / weights[t]
+        whole += mine @ np.linalg.solve(spread, mine)
+        right += mine @ np.linalg.solve(spread, own.root.T @ own.map)
+    return np.asarray(la.solve(whole, right, assume_a="pos"))
+
+
+def inflated_point(problem: Equations, tiles: Sequence[int], scale: Array, ids: NDArray[np.str_]) -> Array:
+    """Map (3, 2 r + q) to one point: what the tiles' images say of it, each with its covariance times a scale, fused as 3-vectors."""
+    own, loading = fitted(problem, ids)
+    maps = [loading @ adjusted_together(problem, [tile], np.ones(1)) for tile in tiles]
+    believed = []
+    for tile in tiles:
+        root = information(problem, problem.held([tile])).root
+        half = la.solve_triangular(root, loading.T, trans="T")
+        believed.append(half.T @ half)
+    total = sum(np.linalg.inv(p) / c for p, c in zip(believed, scale, strict=True))
+    return own + np.linalg.solve(total, sum(np.linalg.inv(p) @ m / c for p, m, c in zip(believed, maps, scale, strict=True)))
+
+
 def weighted_sum(parts: Sequence[Information], weights: Sequence[float] | Array) -> Array:
     """Map to the images from weighted information of several estimates; with every weight 1 the naive independent merge."""
     whole = sum(weight * part.root.T @ part.root for part, weight in zip(parts, weights, strict=True))

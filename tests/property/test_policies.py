@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,18 +17,23 @@ from property.exact_covariance import (
     adjusted_together,
     equations,
     fitted,
+    inflated,
+    inflated_point,
     information,
     intersected,
     largest_ratio,
     located,
     monolithic,
+    split,
     weighted_sum,
 )
 from shapely.geometry.base import BaseGeometry
 
 import submin
 from submin.adjustment.priors import APriori
-from submin.query import covariance_intersection
+from submin.errors import QueryError
+from submin.query import bounded_inflation, covariance_intersection, split_intersection
+from submin.query.bounded_inflation import inflation
 from submin.query.control_set import ControlSet
 from submin.query.covariance_intersection import intersection_weights
 from submin.query.planner import POLICIES
@@ -76,6 +81,8 @@ class Row:
 TABLE = {
     "tile": Row(adjusted_together, ONE_TILE),
     "ci": Row(intersected, SEVERAL_TILES),
+    "bci": Row(inflated, SEVERAL_TILES),
+    "split": Row(split, SEVERAL_TILES),
     "rigorous": Row(adjusted_together, SEVERAL_TILES),
 }
 """Every policy of `submin.query.planner.POLICIES`."""
@@ -137,16 +144,22 @@ def places(problem: Equations) -> dict[str, Ids]:
     return {name: problem.point_ids[chosen] for name, chosen in found.items()}
 
 
+CHOICES = {
+    "ci": (covariance_intersection, "intersection_weights"),
+    "bci": (bounded_inflation, "inflation"),
+    "split": (split_intersection, "split_weights"),
+}
+"""What a policy chooses for a query, and where."""
+
+
 def asked(made: Made, policy: str, monkeypatch: pytest.MonkeyPatch, **question: object) -> tuple[ControlSet, Array]:
-    """An answer, and the weights that Covariance Intersection found for it (1 where it looked for none)."""
-    weights = [np.ones(1)]
-
-    def recorded(information: Array, functionals: Array) -> Array:
-        weights.append(intersection_weights(information, functionals))
-        return weights[-1]
-
-    monkeypatch.setattr(covariance_intersection, "intersection_weights", recorded)
-    return made.network.query(policy=policy, **question), weights[-1]  # type: ignore[arg-type]
+    """An answer, and the weights or scales that the policy chose for it (1 where it chose none)."""
+    chosen = [np.ones(1)]
+    if policy in CHOICES:
+        module, name = CHOICES[policy]
+        choose = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *arguments: chosen.append(choose(*arguments)) or chosen[-1])
+    return made.network.query(policy=policy, **question), chosen[-1]  # type: ignore[arg-type]
 
 
 def exact(made: Made, control: ControlSet, weights: Array) -> tuple[Array, Array]:
@@ -171,7 +184,7 @@ def test_the_answer_is_consistent(made: Made, policy: str, place: str, monkeypat
     np.testing.assert_array_equal(control.ids, made.places[place])
     np.testing.assert_allclose(control.geocentric, positions, rtol=0.0, atol=1e-7)
     assert largest_ratio(true, control.covariance) <= CONSISTENT
-    if policy != "ci":
+    if policy not in CHOICES:
         assert largest_ratio(control.covariance, true) <= CONSISTENT
 
 
@@ -226,6 +239,52 @@ def test_a_naive_independent_merge_is_not_consistent(overlapping: Made, merge: s
     assert 1.5 < ratio <= 2.0 + 1e-6
 
 
+@pytest.mark.parametrize("name", ["overlap", "released camera"])
+def test_a_point_by_itself_is_inflated_by_what_its_tiles_share(
+    name: str, networks: Callable[[str], Made], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, gained = networks(name), []
+    for place in ("overlap of two", "overlap of four"):
+        for point in made.places[place][:4]:
+            scales: list[Array] = []
+            fused: list[tuple[Array, Array, Array]] = []
+            with monkeypatch.context() as patch:
+
+                def recorded(*what: Array, scales: list[Array] = scales, fused: list[tuple[Array, ...]] = fused) -> Array:
+                    fused.append(what)
+                    scales.append(inflation(*what))
+                    return scales[-1]
+
+                patch.setattr(bounded_inflation, "inflation", recorded)
+                control = made.network.query(points=[point], policy="bci")
+            tiles = [made.network.cover.tile_number(tile) for tile in control.tiles]
+            maps = [
+                located(made.problem, inflated(made.problem, tiles, scales[0]), control.ids),
+                inflated_point(made.problem, tiles, scales[1], control.ids),
+            ]
+            origin = made.problem.origin[made.problem.point_ids == point]
+            linear_map = min(maps, key=lambda m: np.abs(origin + (m @ made.problem.data).reshape(-1, 3) - control.geocentric).max())
+            np.testing.assert_allclose(control.geocentric, origin + (linear_map @ made.problem.data).reshape(-1, 3), rtol=0.0, atol=1e-7)
+            assert largest_ratio(linear_map @ linear_map.T, control.covariance) <= CONSISTENT
+            intersected, rigorous = (made.network.query(points=[point], policy=policy).covariance for policy in ("ci", "rigorous"))
+            assert np.trace(rigorous) <= np.trace(control.covariance) * (1.0 + 1e-9) <= np.trace(intersected) * (1.0 + 2e-9)
+            information, _, trace_of_point = fused[1]
+            unbounded = trace_of(intersection_weights(information, trace_of_point), information, trace_of_point)
+            gained.append(trace_of(1.0 / scales[1], information, trace_of_point) / unbounded)
+    assert max(gained) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("place", ["overlap of two", "overlap of four", "border"])
+def test_what_is_known_to_be_independent_is_used(overlapping: Made, place: str) -> None:
+    """The more is known of what tiles share, the tighter the claim."""
+    trace = {
+        policy: np.trace(overlapping.network.query(points=overlapping.places[place], policy=policy).covariance) for policy in
+        ("rigorous", "split", "bci", "ci")
+    }  # fmt: skip
+    assert trace["rigorous"] < trace["split"] < trace["ci"]
+    assert trace["rigorous"] < trace["bci"] <= trace["ci"] * (1.0 + 1e-9)
+
+
 def test_intersection_is_never_worse_than_its_best_tile(overlapping: Made) -> None:
     ids = overlapping.places["overlap of four"]
     merged = overlapping.network.query(points=ids, policy="ci")
@@ -241,6 +300,30 @@ def test_intersection_of_one_tile_is_the_tile(overlapping: Made) -> None:
     assert merged.tiles == alone.tiles and len(merged.tiles) == 1
     np.testing.assert_allclose(merged.geocentric, alone.geocentric, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(merged.covariance, alone.covariance, rtol=0.0, atol=1e-9 * np.abs(alone.covariance).max())
+
+
+@pytest.mark.parametrize(("one", "other"), [((1, 0), (1, 1)), ((0, 0), (1, 1)), ((1, 1), (1, 1)), ((0, 0), (2, 2))])
+def test_the_cross_covariance_of_two_tiles_is_exact(made: Made, one: tuple[int, int], other: tuple[int, int]) -> None:
+    problem, cover = made.problem, made.network.cover
+    tiles = [row * cover.columns + column for row, column in (one, other)]
+    ids = [problem.point_ids[np.isin(problem.point_cell, problem.held([tile]))][::3] for tile in tiles]
+    maps = [located(problem, adjusted_together(problem, [t], np.ones(1)), i) for t, i in zip(tiles, ids, strict=True)]
+    found = made.network.cross_covariance(cover.tile_name(tiles[0]), cover.tile_name(tiles[1]), ids[0], ids[1])
+    expected = maps[0] @ maps[1].T
+    scale = np.sqrt(np.outer(np.square(maps[0]).sum(axis=1), np.square(maps[1]).sum(axis=1)))
+    assert (np.abs(found - expected) / scale).max() < 1e-9
+
+
+def test_the_cross_covariance_keeps_the_order_of_the_ids(overlapping: Made) -> None:
+    cover, problem = overlapping.network.cover, overlapping.problem
+    names = [cover.tile_name(tile) for tile in (0, 1)]
+    ids = [problem.point_ids[np.isin(problem.point_cell, problem.held([tile]))][:4] for tile in (0, 1)]
+    one = overlapping.network.cross_covariance(*names, *ids)
+    turned = overlapping.network.cross_covariance(*names, ids[0][::-1], ids[1])
+    np.testing.assert_array_equal(turned.reshape(4, 3, 12), one.reshape(4, 3, 12)[::-1])
+    np.testing.assert_allclose(overlapping.network.cross_covariance(*names[::-1], *ids[::-1]), one.T, rtol=0.0, atol=1e-9)
+    with pytest.raises(QueryError, match=r"tile r000c000 does not hold 1 of 2 points.*elsewhere"):
+        overlapping.network.cross_covariance(*names, ["elsewhere", str(ids[0][0])], ids[1])
 
 
 def random_information(rng: np.random.Generator, tiles: int, size: int) -> Array:
@@ -271,6 +354,43 @@ def test_weights_meet_the_optimality_condition(seed: int) -> None:
     spread = covariance @ functionals @ covariance
     shares = np.einsum("ij,tji->t", spread, information)
     assert shares.max() <= (1.0 + 1e-6) * np.trace(covariance @ functionals)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("tiles", [2, 3, 5])
+def test_inflation_lies_between_independence_and_intersection(seed: int, tiles: int) -> None:
+    rng = np.random.default_rng(300 + seed)
+    information = random_information(rng, tiles, 9)
+    functionals = random_functionals(rng, 9)
+
+    def trace(bound: float) -> float:
+        scale = bounded_inflation.inflation(information, np.full((tiles, tiles), bound), functionals)
+        return trace_of(1.0 / scale, information, functionals)
+
+    independent = trace_of(np.ones(tiles), information, functionals)
+    intersected = trace_of(intersection_weights(information, functionals), information, functionals)
+    assert trace(0.0) == pytest.approx(independent, rel=1e-12)
+    assert trace(1.0) == pytest.approx(intersected, rel=1e-9)
+    bounds = [trace(bound) for bound in (0.0, 0.3, 0.7, 0.95, 1.0)]
+    assert all(tighter <= looser * (1.0 + 1e-4) for tighter, looser in pairwise(bounds))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_scaled_covariances_bound_whatever_is_correlated_within_the_bound(seed: int) -> None:
+    """Three estimates of random cross-correlations, fused with the scales of the policy: the true covariance is below the claim."""
+    rng = np.random.default_rng(400 + seed)
+    size, count = 4, 3
+    common, own = rng.normal(size=(count, size, 6)), rng.normal(size=(count, size, 5))
+    covariance = np.stack([c @ c.T + o @ o.T for c, o in zip(common, own, strict=True)])
+    roots = [np.linalg.inv(np.linalg.cholesky(p)) for p in covariance]
+    bound = np.array([[np.linalg.norm(roots[s] @ common[s] @ common[t].T @ roots[t].T, 2) for t in range(count)] for s in range(count)])
+    information = np.linalg.inv(covariance)
+    scale = bounded_inflation.inflation(information, bound, np.eye(size))
+    claimed = np.linalg.inv(sum(j / c for j, c in zip(information, scale, strict=True)))
+    gains = [claimed @ j / c for j, c in zip(information, scale, strict=True)]
+    shared = sum(g @ c for g, c in zip(gains, common, strict=True))
+    true = shared @ shared.T + sum(g @ o @ o.T @ g.T for g, o in zip(gains, own, strict=True))
+    assert largest_ratio(true, claimed) <= 1.0 + 1e-9
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -285,8 +285,33 @@ def test_npz_of_something_else(tmp_path: Path) -> None:
 
 def test_row_groups_cover_all_points_and_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "_GROUP_VALUES", 1000)
-    groups = list(tables._row_groups(100))
+    groups = list(tables.row_groups(100))
     assert groups[0][0] == 0 and groups[-1][1] == 100
     assert all(a[1] == b[0] for a, b in pairwise(groups))
     # A group may pass the limit by less than one row.
     assert all(9 * sum(range(a + 1, b + 1)) <= 1000 + 9 * b for a, b in groups)
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_gcp_claims_no_more_than_the_covariance_of_each_point(tmp_path: Path, n: int) -> None:
+    table = point_table(n)
+    write_table(tmp_path / "t.gcp", table)
+    rows = np.array([[float(v) for v in line.split()] for line in (tmp_path / "t.gcp").read_text().splitlines()])
+    assert rows.shape == (n, 7)
+    np.testing.assert_array_equal(rows[:, 0], np.arange(1, n + 1))
+    for k, name in enumerate(("latitude", "longitude", "height"), start=1):
+        np.testing.assert_allclose(rows[:, k], table.columns[name], atol=1e-5 if name == "height" else 1e-11)
+    for i, sigma in enumerate(rows[:, 4:]):
+        own = table.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        whitened = np.linalg.eigvalsh(own / np.outer(sigma, sigma))
+        assert 1.0 - 1e-4 < whitened[-1] <= 1.0
+
+
+def test_gcp_keeps_ids_that_are_whole_numbers(tmp_path: Path) -> None:
+    table = point_table(3)
+    ids = np.array(["17", "3", "250"])
+    write_table(tmp_path / "t.gcp", ControlTable({**table.columns, "point_id": ids}, table.covariance, METADATA))
+    assert [line.split()[0] for line in (tmp_path / "t.gcp").read_text().splitlines()] == ["17", "3", "250"]
+    ids[1] = "03"
+    write_table(tmp_path / "t.gcp", ControlTable({**table.columns, "point_id": ids}, table.covariance, METADATA))
+    assert [line.split()[0] for line in (tmp_path / "t.gcp").read_text().splitlines()] == ["1", "2", "3"]
