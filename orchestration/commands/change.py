@@ -89,12 +89,14 @@ def run(
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter)
     lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
+    if result.control_fused or result.observations_fused:
+        lines.append(f"{result.control_fused} control points and {result.observations_fused} clusters of observed positions added")
     if result.rays_used:
         lines.append(
             f"{result.rays_used:,} rays used, {result.rays_rejected:,} rejected as blunders, RMS {result.ray_rms_px:.3f} px; "
             f"{result.seconds:.1f} s, {result.peak_memory_mb:.0f} MB"
         )
-    if not result.fused and not result.rejected:
+    if not (result.fused or result.control_fused or result.observations_fused or result.rejected):
         lines[0] = f"{network} {result.version}: nothing is left to do, all {result.skipped} blocks are in the network"
     lines += [f"bad camera {f.image_id}: {f.reason}" for f in result.flagged]
     lines += [f"not used: {c.reason}" for c in result.contradicted]
