@@ -13,13 +13,14 @@ from orchestration.change import Move, finish, place, settle, take_points
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
 from orchestration.tasks import BlockRays, FlaggedImage, Gate, adjust_blocks
+from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.innovation import REJECTED, BlockTest
 from submin.network.registration import LooseRays, together
 from submin.storage.block_images import network_images as network_images
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import enter_check_points
-from submin.storage.control_blocks import control_point_of
+from submin.storage.control_blocks import points_of
 from submin.storage.ledger import UNTESTED, Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 
@@ -30,10 +31,17 @@ LEAST_AGREEING = 0.5
 
 @dataclass(frozen=True)
 class Rejected:
-    """A block that was not fused, and why."""
+    """A block that was not fused, and why; ``points`` are those of a block of surveyed ones."""
 
     block_id: str
     reason: str
+    kind: str = "images"
+    points: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, block: Block, reason: str) -> Rejected:
+        """The rejection of a block."""
+        return cls(block.block_id, reason, block.kind, points_of(block))
 
 
 @dataclass(frozen=True)
@@ -52,16 +60,18 @@ class BatchResult:
     Attributes
     ----------
     version : number of the committed version
-    fused : ids of the fused blocks; rejected : the others; doubtful : fused ones that agree with the network as few good ones do
+    fused : the fused blocks; rejected : the others; doubtful : fused ones that agree with the network as few good ones do
     flagged : images whose camera the judged tiles find bad
+    contradicted : surveyed points that contradict the network, by judged tile
     tiles : that were judged; unsettled : tiles whose judgement did not come to rest (their rays are used as last judged)
     """
 
     version: int
-    fused: tuple[str, ...]
+    fused: tuple[Block, ...]
     rejected: tuple[Rejected, ...]
     doubtful: tuple[Doubtful, ...]
     flagged: tuple[FlaggedImage, ...]
+    contradicted: dict[int, tuple[ContradictedPoint, ...]]
     tiles: tuple[int, ...]
     unsettled: tuple[int, ...]
 
@@ -87,19 +97,23 @@ def fuse_batch(
     ledger = Ledger.of(base)
     unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
     if not blocks and not unsaid:
-        return BatchResult(base.number, (), tuple(refused), (), (), (), ())  # the same command again writes nothing
+        return BatchResult(base.number, (), tuple(refused), (), (), {}, (), ())  # the same command again writes nothing
     settled = settle(session, base, move, executor, reporter)
     version += 1
     lost = settled.rejected[base.image_count() :]
     of_block = np.repeat(np.arange(len(blocks)), [len(block.images) for block in blocks])
     rejected_rays = np.bincount(of_block, weights=lost, minlength=len(blocks)).astype(np.int64).tolist()
     entries = [
-        Entry(b.block_id, b.content_hash(), "fused", "", version, len(b.images), len(b), n, *_tested(tests.get(b.block_id), base.number))
+        Entry(
+            b.block_id, b.content_hash(), "fused", "", version, len(b.images), len(b), n,
+            *_tested(tests.get(b.block_id), base.number), kind=b.kind,
+        )
         for b, n in zip(blocks, rejected_rays, strict=True)
     ]  # fmt: skip
     entries += [
-        Entry(r.block_id, "", "rejected", r.reason, version, 0, 0, 0, *_tested(tests.get(r.block_id), base.number)) for r in unsaid
-    ]  # fmt: skip
+        Entry(r.block_id, "", "rejected", r.reason, version, 0, 0, 0, *_tested(tests.get(r.block_id), base.number), kind=r.kind)
+        for r in unsaid
+    ]
     if blocks and check_points is not None:
         enter_check_points(zarr.open_group(session.store, mode="r+"), base, check_points)
     records = [image for block in blocks for image in block.images]
@@ -108,7 +122,7 @@ def fuse_batch(
         Doubtful(b.block_id, tests[b.block_id], base.number) for b in blocks if b.block_id in tests and tests[b.block_id].doubtful
     )
     return BatchResult(
-        version, tuple(block.block_id for block in blocks), tuple(refused), doubtful, settled.flagged,
+        version, tuple(blocks), tuple(refused), doubtful, settled.flagged, settled.contradicted,
         tuple(r.tile for r in settled.reports), tuple(r.tile for r in settled.reports if not r.converged),
     )  # fmt: skip
 
@@ -116,15 +130,15 @@ def fuse_batch(
 def _stage_one(
     blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected], innovation: float
 ) -> tuple[dict[str, NDArray[np.bool_]], dict[str, BlockTest]]:
-    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of control points.
+    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of surveyed points.
 
     Beside it the tests of blocks, also of rejected ones, that have points in common with the last version.
     """
-    of_images = [block for block in blocks if control_point_of(block.block_id) is None]
+    of_images = [block for block in blocks if block.kind == "images"]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
     arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid, _gate(group, base)) for group in groups]
     handles = executor.submit_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
-    accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if control_point_of(b.block_id) is not None}
+    accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if b.kind != "images"}
     tests: dict[str, BlockTest] = {}
     for outcome in (outcome for group in executor.results(handles) for outcome in group):
         reason = outcome.reason or disagreement(outcome.accepted)
@@ -178,7 +192,7 @@ def _register(
         bad = _misplaced(blocks, rays, move)
         if not bad:
             return blocks, move
-        refused.extend(Rejected(blocks[k].block_id, bad[k]) for k in sorted(bad))
+        refused.extend(Rejected.of(blocks[k], bad[k]) for k in sorted(bad))
         blocks = [block for k, block in enumerate(blocks) if k not in bad]
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
 from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, report_of, update_tile
+from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import LooseRays, Registration, contradictions, register, taken_out, together
 from submin.sensors import width_of
@@ -24,7 +25,7 @@ from submin.storage.arrays import append_table, group_of, hash_ids, replace_tabl
 from submin.storage.catalogue_schema import ImageRecord
 from submin.storage.ledger import Entry, append_entries
 from submin.storage.network_store import Snapshot, commit
-from submin.storage.schema import image_columns
+from submin.storage.schema import image_columns, write_joint
 from submin.tiling.cover import Cover
 
 Ids = NDArray[np.str_]
@@ -86,6 +87,11 @@ class Settled:
     flags: frozenset[tuple[int, int]]
     gone: tuple[str, ...]
     rejected: NDArray[np.int64]
+
+    @property
+    def contradicted(self) -> dict[int, tuple[ContradictedPoint, ...]]:
+        """Surveyed points by the judged tile that finds that they contradict it."""
+        return {report.tile: report.contradicted for report in self.reports}
 
     @property
     def flagged(self) -> tuple[FlaggedImage, ...]:
@@ -259,6 +265,7 @@ def finish(
         if name in root:
             del root[name]
     append_table(group_of(root, "images"), image_columns(move.images, records))
+    write_joint(root, move.images)
     set_rows(group_of(root, "images"), "withdrawn", np.array(withdrawn, dtype=np.int64), np.ones(len(withdrawn), dtype=np.uint8))
     _write_flags(root, settled.flags, base.flags())
     append_entries(group_of(root, "ledger"), entries)

@@ -8,17 +8,19 @@ from typing import Any
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from orchestration.run import fuse_blocks
+from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.storage.catalogue_schema import PointTable
-from submin.storage.control_blocks import control_blocks, control_point_of
+from submin.storage.control_blocks import control_blocks
 from submin.storage.network_store import Snapshot
 
 
 @dataclass(frozen=True)
 class RejectedPoint:
-    """A control point that was not taken, and why."""
+    """A control point that was not taken, or a set of correlated ones by its block, and why."""
 
     point_id: str
     reason: str
+    points: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -29,11 +31,16 @@ class ControlAdded:
     fused: int
     skipped: int
     rejected: tuple[RejectedPoint, ...]
+    contradicted: tuple[ContradictedPoint, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
-        rejected = [{"point_id": r.point_id, "reason": r.reason} for r in self.rejected]
-        return {"version": self.version, "control_fused": self.fused, "control_skipped": self.skipped, "control_rejected": rejected}
+        rejected = [{"point_id": r.point_id, "reason": r.reason, "points": list(r.points)} for r in self.rejected]
+        flagged = [{"point_id": c.point_id, "reason": c.reason} for c in self.contradicted]
+        return {
+            "version": self.version, "control_fused": self.fused, "control_skipped": self.skipped, "control_rejected": rejected,
+            "control_flagged": flagged,
+        }  # fmt: skip
 
 
 def add_control(points: PointTable, source: str, where: str, executor: Executor, reporter: Reporter | None = None) -> ControlAdded:
@@ -42,11 +49,14 @@ def add_control(points: PointTable, source: str, where: str, executor: Executor,
     Raises
     ------
     InputError
-        When the points are correlated: this release takes points with a covariance each.
+        When the points have a joint covariance that is not positive definite, or not that of the points.
     """
     reporter = reporter or Silent()
     reporter.begin(len(points))
     blocks = control_blocks(points, Snapshot.open(where).metadata.ellipsoid, source)
     tally = fuse_blocks(blocks, where, executor, max(len(points), 1), reporter)
-    rejected = tuple(RejectedPoint(control_point_of(r.block_id) or r.block_id, r.reason) for r in tally.rejected)
-    return ControlAdded(f"v{tally.version}", tally.control, len(points) - tally.control - len(rejected), rejected)
+    rejected = tuple(RejectedPoint(r.points[0] if len(r.points) == 1 else r.block_id, r.reason, r.points) for r in tally.rejected)
+    skipped = len(points) - tally.control - sum(len(r.points) for r in rejected)
+    ours = set(points.point_ids.tolist())
+    found = tuple(c for c in tally.contradicted if c.point_id in ours)
+    return ControlAdded(f"v{tally.version}", tally.control, skipped, rejected, found)

@@ -23,7 +23,7 @@ from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loading
 from submin.query.planner import DETERMINED_METRES
 from submin.sensors import sensor_named, width_of
 from submin.storage.catalogue_schema import Block, PointTable
-from submin.storage.control_blocks import control_block_id
+from submin.storage.control_blocks import control_block_id, control_set_id
 from submin.storage.dense_store import Member
 
 Array = NDArray[np.float64]
@@ -32,11 +32,10 @@ Array = NDArray[np.float64]
 def control_members(points: PointTable, ellipsoid: Ellipsoid) -> Iterator[Member]:
     """Control points as positions: one set each, or one of all where they have a joint covariance."""
     geocentric, axes = geodetic_to_geocentric(points.geodetic, ellipsoid), local_axes(points.geodetic)
-    if points.joint_covariance is not None:
+    if points.joint_covariance is not None and len(points) > 1:
         ids = points.point_ids
-        name = control_block_id(str(np.sort(ids)[0])) + (f" and {len(ids) - 1} more" if len(ids) > 1 else "")
         stated = json.dumps([ids.tolist(), points.geodetic.tolist(), points.joint_covariance.tolist()])
-        yield Member(positions(name, ids, geocentric, points.joint_covariance), "control", stated=stated)
+        yield Member(positions(control_set_id(ids), ids, geocentric, points.joint_covariance), "control", stated=stated)
         return
     for k, point in enumerate(points.point_ids.tolist()):
         covariance = axes[k].T @ points.covariance_enu[k] @ axes[k]

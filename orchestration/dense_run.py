@@ -25,7 +25,6 @@ from submin.network.pending import DenseNetwork, check_regular
 from submin.storage.arrays import append_table, group_of, set_rows
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, ImageRecord, PointTable
-from submin.storage.control_blocks import control_point_of
 from submin.storage.dense_store import Member, append_members, read_members, read_points, read_state, write_state
 from submin.storage.ledger import Entry, Ledger, append_entries
 from submin.storage.network_store import Snapshot, begin_change, commit
@@ -57,7 +56,7 @@ class DenseRunResult:
 
     Attributes
     ----------
-    version : of the network afterwards; fused, skipped : numbers of blocks and clusters; control_fused : of sets of control
+    version : of the network afterwards; fused, skipped : numbers of blocks and clusters; control_fused : of control points
     pending : blocks of the network that wait for a point of theirs to be determined
     observations : positions and baselines that came
     doubtful : blocks that hardly agree with what was there when they came
@@ -142,6 +141,7 @@ class Working:
             self._refuse_shared_pass(member)
         else:
             member = arrival
+            self._refuse_twice(member)
         check_regular(member.cluster)
         self._refuse_far(member.cluster)
         if isinstance(arrival, Block):
@@ -153,6 +153,16 @@ class Working:
     def inner(self) -> Mapping[str, tuple[float, int]]:
         """Chi-square and redundancy that stayed behind in blocks of images."""
         return {name: (member.inner_square, member.inner_redundancy) for name, member in self.members.items()}
+
+    def _refuse_twice(self, member: Member) -> None:
+        """Refuse control of a point that is control already, in another set: a survey counts once."""
+        for other in self.members.values():
+            common = sorted(set(member.point_ids) & set(other.point_ids)) if member.kind == other.kind == "control" else []
+            if common:
+                raise InputError(
+                    f"point {common[0]} is control of the network already, in block {other.block_id}; a survey counts once; "
+                    f"withdraw that first ('submin withdraw --control {common[0]}')"
+                )
 
     def _refuse_shared_pass(self, member: Member) -> None:
         for other in self.members.values():
@@ -218,8 +228,8 @@ def add_dense_control(points: PointTable, place: str, reporter: Reporter | None 
     reporter.begin(len(points))
     members = list(control_members(points, Snapshot.open(place).metadata.ellipsoid))
     tally = fuse_arrivals(members, place, max(len(members), 1), reporter)
-    rejected = tuple(RejectedPoint(control_point_of(r.block_id) or r.block_id, r.reason) for r in tally.rejected)
-    return ControlAdded(f"v{tally.version}", tally.control, tally.control_skipped, rejected)
+    rejected = tuple(RejectedPoint(r.points[0] if len(r.points) == 1 else r.block_id, r.reason, r.points) for r in tally.rejected)
+    return ControlAdded(f"v{tally.version}", tally.control, tally.control_skipped, rejected, ())
 
 
 def fuse_arrivals(arrivals: Iterable[Arrival], place: str, batch: int, reporter: Reporter) -> DenseTally:
@@ -252,7 +262,7 @@ def withdraw_dense(place: str, *, block: str | None = None, image: str | None = 
         known = Snapshot.open(place)
         work = Working(known)
         name = block if block is not None else _control_of(work, control or "")
-        if name not in work.members or (block is not None and control_point_of(name) is not None):
+        if name not in work.members or (block is not None and work.members[name].kind == "control"):
             kind = "block" if block is not None else "control point"
             raise InputError(
                 f"{place}: {kind} {block or control!r} is not in the network; see 'submin info', or 'submin history' for what came and went"
@@ -263,7 +273,8 @@ def withdraw_dense(place: str, *, block: str | None = None, image: str | None = 
         session, base = begin_change(place, known.number)
         root, version = zarr.open_group(session.store, mode="r+"), base.number + 1
         what = f"block {block}" if block is not None else f"control point {control}"
-        entry = Entry(name, before.content, "withdrawn", ("block" if block is not None else "control point") + " withdrawn", version)
+        reason = ("block" if block is not None else "control point") + " withdrawn"
+        entry = Entry(name, before.content, "withdrawn", reason, version, kind=before.kind)
         append_entries(group_of(root, "ledger"), [entry])
         images = base.image_columns(["block_id", "withdrawn"])
         rows = np.flatnonzero((images["block_id"] == name) & (images["withdrawn"] == 0))
@@ -286,25 +297,26 @@ def _new(arrivals: Iterable[Arrival], work: Working, tally: DenseTally, reporter
         name = arrival.block_id
         taken = work.taken(arrival)
         if taken:
-            if control_point_of(name) is None:
-                tally.skipped += 1
+            if arrival.kind == "control":
+                tally.control_skipped += len(arrival.point_ids)
             else:
-                tally.control_skipped += 1
+                tally.skipped += 1
             reporter.fused(1)
             continue
         try:
             if taken is False:
-                raise InputError(_with_other_content(name))
+                raise InputError(_with_other_content(arrival))
             yield arrival, work.admitted(arrival)
         except (InputError, NumericalError) as error:
-            yield arrival, Rejected(name, str(error))
+            yield arrival, Rejected(name, str(error), arrival.kind, arrival.point_ids if arrival.kind == "control" else ())
 
 
-def _with_other_content(name: str) -> str:
-    control = control_point_of(name)
-    if control is not None:
-        return f"control point {control} is already in the network with other values; withdraw it first ('submin withdraw --control')"
-    return f"block {name} is already in the network with other content; withdraw it first, or give the new one another id"
+def _with_other_content(arrival: Arrival) -> str:
+    if isinstance(arrival, Member) and arrival.kind == "control":
+        points = arrival.point_ids
+        what = f"control point {points[0]}" if len(points) == 1 else f"set of {len(points)} control points"
+        return f"{what} is already in the network with other values; withdraw it first ('submin withdraw --control')"
+    return f"block {arrival.block_id} is already in the network with other content; withdraw it first, or give the new one another id"
 
 
 def _fuse_batch(place: str, work: Working, group: Sequence[tuple[Arrival, Member | Rejected]], tally: DenseTally) -> None:
@@ -327,19 +339,21 @@ def _fuse_batch(place: str, work: Working, group: Sequence[tuple[Arrival, Member
     new, records = _images([arrival for arrival, _ in members if isinstance(arrival, Block)])
     append_table(group_of(root, "images"), image_columns(new, records))
     entries = [_entry(arrival, member, version) for arrival, member in members]
-    append_entries(group_of(root, "ledger"), [*entries, *(Entry(r.block_id, "", "rejected", r.reason, version) for r in unsaid)])
+    append_entries(
+        group_of(root, "ledger"), [*entries, *(Entry(r.block_id, "", "rejected", r.reason, version, kind=r.kind) for r in unsaid)]
+    )
     root.attrs["version"] = version
     commit(session, version, f"{len(members)} blocks fused, {len(refused)} rejected")
     tally.version = version
-    control = sum(member.kind == "control" for _, member in members)
-    tally.control, tally.fused = tally.control + control, tally.fused + len(members) - control
+    tally.control += sum(len(member.cluster) for _, member in members if member.kind == "control")
+    tally.fused += sum(member.kind != "control" for _, member in members)
     tally.observations += sum(len(member.cluster) for _, member in members)
 
 
 def _entry(arrival: Arrival, member: Member, version: int) -> Entry:
     """The line of the ledger: the set is there, fused or waiting."""
     images = len(arrival.images) if isinstance(arrival, Block) else 0
-    return Entry(member.block_id, arrival.content_hash(), "fused", "", version, images, len(member.cluster))
+    return Entry(member.block_id, arrival.content_hash(), "fused", "", version, images, len(member.cluster), kind=member.kind)
 
 
 def _images(blocks: Sequence[Block]) -> tuple[list[NetworkImage], list[ImageRecord]]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from submin import Network
+from submin.sensors import SURVEYS
 from submin.storage.accuracy_map import accuracy_of_all
 from submin.storage.dense_reader import DenseReader
 from submin.storage.ledger import Ledger
@@ -20,7 +21,7 @@ def describe(network: Network) -> dict[str, Any]:
     snapshot = network.snapshot
     cells = [snapshot.cell_attributes(number) for number in network.cell_numbers()]
     images = snapshot.image_columns(["image_id", "sensor", "released", "withdrawn"])
-    here = (images["withdrawn"] == 0) & (images["sensor"] != "survey")
+    here = (images["withdrawn"] == 0) & ~np.isin(images["sensor"], SURVEYS)
     ledger = Ledger.of(snapshot)
     accuracy = accuracy_of_all(network)
     reported = ~accuracy.thinned & ~accuracy.retired
@@ -37,6 +38,7 @@ def describe(network: Network) -> dict[str, Any]:
         "images_flagged": ", ".join(images["image_id"][here & (images["released"] == 1)].tolist()),
         "blocks": len(ledger.fused()),
         "control_points": len(ledger.control_points()),
+        "control_sets": len(ledger.control_sets()),
         "tiles": len(snapshot.tile_numbers()),
         "tiles_of_the_area": network.cover.tile_count,
         "cells": len(cells),

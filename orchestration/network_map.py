@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from submin import Network
 from submin.errors import InputError
 from submin.formats.replacing import replacing
+from submin.sensors import SURVEYS
 from submin.storage.accuracy_map import PointAccuracy, accuracy_map
 from submin.tiling.cover import Cover
 
@@ -160,7 +161,7 @@ def network_figure(network: Network, title: str | None = None) -> Figure:
 
 def _images(network: Network) -> _Images:
     columns = network.snapshot.image_columns(["image_id", "sensor", "footprint", "released", "withdrawn"])
-    here = (columns["withdrawn"] == 0) & (columns["sensor"] != "survey")  # views of control points are no images
+    here = (columns["withdrawn"] == 0) & ~np.isin(columns["sensor"], SURVEYS)  # views of control points are no images
     columns = {name: values[here] for name, values in columns.items()}
     flagged = columns["released"] == 1
     given = np.flatnonzero(columns["footprint"] != "")

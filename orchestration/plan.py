@@ -26,7 +26,7 @@ from submin.network.network_image import image_set
 from submin.sensors import width_of
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
-from submin.storage.control_blocks import control_blocks, control_point_of
+from submin.storage.control_blocks import control_blocks
 from submin.storage.image_footprints import image_footprints
 from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
@@ -184,7 +184,7 @@ def _arrivals(catalogue: Catalogue, snapshot: Snapshot, refused: list[Rejected],
     survey = () if control is None else control_blocks(control, ellipsoid, f"{catalogue.path}/control")
     for each in chain(catalogue.blocks(), survey):
         reporter.fused(1)
-        is_control = control_point_of(each.block_id) is not None
+        is_control = each.kind == "control"
         if ledger.holds(each):
             tally.already_there += not is_control
             continue

@@ -14,10 +14,10 @@ from orchestration.run import check_frames
 from submin.errors import InputError
 from submin.query.planner import check_policy
 from submin.query.readjustment import Readjusted, coupled_images, readjust
+from submin.sensors import SURVEYS
 from submin.storage.adjusted import AdjustedCameras, AdjustedWriter
 from submin.storage.arrays import group_of, read_record
 from submin.storage.catalogue import Catalogue
-from submin.storage.control_blocks import control_point_of
 from submin.storage.dense_reader import refuse_dense
 from submin.storage.ledger import Ledger
 from submin.storage.network import Network
@@ -111,9 +111,9 @@ def readjust_network(
 
 def _groups(network: Network, wanted: set[str]) -> tuple[NDArray[np.str_], list[NDArray[np.int32]]]:
     """Block (m,) of each image of the network, and groups of coupled images of which one is of a wanted block."""
-    columns = network.snapshot.image_columns(["block_id", "withdrawn"])
+    columns = network.snapshot.image_columns(["block_id", "sensor", "withdrawn"])
     block_of = columns["block_id"]
-    usable = (columns["withdrawn"] == 0) & np.array([control_point_of(str(name)) is None for name in block_of], dtype=np.bool_)
+    usable = (columns["withdrawn"] == 0) & ~np.isin(columns["sensor"], SURVEYS)
     priors = network.image_set(np.arange(len(block_of), dtype=np.int32)).priors
     groups = coupled_images(priors, usable)
     return block_of, [group for group in groups if not wanted.isdisjoint(block_of[group].tolist())]

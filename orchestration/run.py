@@ -15,11 +15,12 @@ from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from orchestration.tasks import FlaggedImage
+from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import InputError
 from submin.network.innovation import REJECTED
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
-from submin.storage.control_blocks import control_blocks, control_point_of
+from submin.storage.control_blocks import control_blocks, observed_positions, points_of
 from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import writing
@@ -35,7 +36,8 @@ class RunResult:
     ----------
     version : of the network afterwards; fused, skipped : numbers of blocks; rejected, flagged : with reasons
     doubtful : fused blocks that agree with the network as few good ones do
-    control_fused : number of control points
+    control_fused : number of control points; observations_fused : of clusters of observations
+    contradicted : surveyed points that contradict the network, with reasons
     rays_used, rays_rejected : rays in the network afterwards; ray_rms_px : residual of the used ones, per coordinate
     """
 
@@ -43,9 +45,11 @@ class RunResult:
     fused: int
     skipped: int
     control_fused: int
+    observations_fused: int
     rejected: tuple[Rejected, ...]
     doubtful: tuple[Doubtful, ...]
     flagged: tuple[FlaggedImage, ...]
+    contradicted: tuple[ContradictedPoint, ...]
     ray_rms_px: float
     rays_used: int
     rays_rejected: int
@@ -60,6 +64,7 @@ class RunResult:
             "blocks_fused": self.fused,
             "blocks_skipped": self.skipped,
             "control_fused": self.control_fused,
+            "observations_fused": self.observations_fused,
             "blocks_rejected": [{"block_id": r.block_id, "reason": r.reason} for r in self.rejected],
             "blocks_doubtful": [
                 {
@@ -74,6 +79,7 @@ class RunResult:
                 for d in self.doubtful
             ],
             "images_flagged": [{"image_id": f.image_id, "reason": f.reason} for f in self.flagged],
+            "control_flagged": [{"point_id": c.point_id, "reason": c.reason} for c in self.contradicted],
             "ray_rms_px": self.ray_rms_px,
             "rays_used": self.rays_used,
             "rays_rejected": self.rays_rejected,
@@ -92,9 +98,11 @@ class Tally:
     rejected: list[Rejected] = field(default_factory=list)
     doubtful: list[Doubtful] = field(default_factory=list)
     flagged: dict[int, FlaggedImage] = field(default_factory=dict)
+    by_tile: dict[int, tuple[ContradictedPoint, ...]] = field(default_factory=dict)
     unsettled: set[int] = field(default_factory=set)
     fused: int = 0
     control: int = 0
+    observations: int = 0
     skipped: int = 0
 
     def add(self, batch: BatchResult) -> None:
@@ -104,9 +112,15 @@ class Tally:
         self.doubtful.extend(batch.doubtful)
         self.flagged.update({f.row: f for f in batch.flagged})
         self.unsettled = (self.unsettled - set(batch.tiles)) | set(batch.unsettled)
-        control = sum(control_point_of(block_id) is not None for block_id in batch.fused)
-        self.control += control
-        self.fused += len(batch.fused) - control
+        self.by_tile.update(batch.contradicted)
+        self.control += sum(len(points_of(block)) for block in batch.fused if block.kind == "control")
+        self.observations += sum(block.kind == "observations" for block in batch.fused)
+        self.fused += sum(block.kind == "images" for block in batch.fused)
+
+    @property
+    def contradicted(self) -> tuple[ContradictedPoint, ...]:
+        """Surveyed points that contradict the network as their tiles have judged them last."""
+        return tuple(sorted((point for points in self.by_tile.values() for point in points), key=lambda point: point.point_id))
 
 
 def run(
@@ -128,15 +142,36 @@ def run(
     check_frames(catalogue, Snapshot.open(place))
     summary = catalogue.validate()
     control = catalogue.points("control")
-    reporter.begin(summary.blocks + (0 if control is None else len(control)))
+    observed = observation_blocks(catalogue)
+    reporter.begin(summary.blocks + (0 if control is None else len(control)) + summary.clusters)
     every = chain(
-        catalogue.blocks(), () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
+        catalogue.blocks(),
+        () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control"),
+        observed,
     )
     check = catalogue.points("check")
     tally = fuse_blocks(
         every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids
     )
     return _result(Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
+
+
+def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:
+    """Blocks of a catalogue's clusters of positions, one after the other.
+
+    Raises
+    ------
+    InputError
+        At once, when a cluster cannot enter a factored network: it holds baselines, or its covariance is as good as singular.
+    """
+
+    def blocks() -> Iterator[Block]:
+        source = f"{catalogue.path}/observations"
+        return (observed_positions(cluster, catalogue.metadata.ellipsoid, source) for cluster in catalogue.observations())
+
+    for _ in blocks():  # all of them before anything is written
+        pass
+    return blocks()
 
 
 def fuse_blocks(
@@ -158,7 +193,7 @@ def fuse_blocks(
         new = _new_blocks(blocks, Ledger.of(known), tally, reporter)
         while batch := list(islice(new, max(batch_blocks, 1))):
             good = [block for block, reason in batch if reason is None]
-            refused = [Rejected(block.block_id, reason) for block, reason in batch if reason is not None]
+            refused = [Rejected.of(block, reason) for block, reason in batch if reason is not None]
             tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, innovation, check_points))
             reporter.fused(len(batch))
     return tally
@@ -170,8 +205,8 @@ def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -
     used, in_pixels = (sum(cell[name] for cell in cells) for name in ("accepted", "pixel_rays"))
     square = sum(cell["square_px"] for cell in cells)
     return RunResult(
-        after.version, tally.fused, tally.skipped, tally.control,
-        tuple(tally.rejected), tuple(tally.doubtful), tuple(tally.flagged[row] for row in sorted(released)),
+        after.version, tally.fused, tally.skipped, tally.control, tally.observations,
+        tuple(tally.rejected), tuple(tally.doubtful), tuple(tally.flagged[row] for row in sorted(released)), tally.contradicted,
         float(np.sqrt(square / (2.0 * in_pixels))) if in_pixels else 0.0, used, sum(cell["rays"] for cell in cells) - used,
         tuple(after.cover.tile_name(t) for t in sorted(tally.unsettled)), time.monotonic() - started, executor.peak_memory_mb(),
     )  # fmt: skip
@@ -181,7 +216,7 @@ def _new_blocks(blocks: Iterable[Block], ledger: Ledger, tally: Tally, reporter:
     """Blocks that the network does not have, each with the reason for which it cannot come in, if any."""
     for block in blocks:
         if ledger.holds(block):
-            tally.skipped += control_point_of(block.block_id) is None
+            tally.skipped += block.kind == "images"
             reporter.fused(1)
             continue
         reason = ledger.refusal(block)

@@ -19,6 +19,7 @@ from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import blind_image, intersect
 from submin.adjustment.rays import Rays
 from submin.adjustment.status import Cause, Status
+from submin.adjustment.surveyed_points import ContradictedPoint, contradicted_points
 from submin.errors import NumericalError, SubminError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
@@ -100,6 +101,7 @@ class TileReport:
     changed: tuple[int, ...]
     cells: dict[int, CellReport]
     flagged: tuple[FlaggedImage, ...]
+    contradicted: tuple[ContradictedPoint, ...]
     converged: bool
     writes: icechunk.ForkSession
 
@@ -235,7 +237,7 @@ def update_tile(
     if not len(seen):  # the last ray has gone
         emptied = {cell.number: CellReport.empty() for cell in held if Cover.owner(cell.number) == tile}
         nothing = {number: (seen, empty_sums(0, snapshot.metadata.parameters)) for number in emptied}
-        return TileUpdate(tile, nothing, TileReport(tile, tuple(emptied), emptied, (), True, writes))
+        return TileUpdate(tile, nothing, TileReport(tile, tuple(emptied), emptied, (), (), True, writes))
     members = sorted(zip(_images(snapshot, seen, new_images), seen.tolist(), strict=True), key=lambda member: member[0].image_id)
     rows = np.array([row for _, row in members], dtype=np.int32)
     images = image_set(
@@ -270,7 +272,10 @@ def update_tile(
                 write_cell(root, cover.cell_name(cell.number), new, float(squares[own_rays].sum()), counted)
             sums[cell.number] = (new.images, new.sums)
         reports[cell.number] = _report(judged)
-    return TileUpdate(tile, sums, TileReport(tile, tuple(sums), reports, _flagged(result, images, rows), result.converged, writes))
+    own = np.concatenate([np.full(len(cell), Cover.owner(cell.number) == tile) for cell in held])
+    contradicted = contradicted_points(images, together.rays, result, np.concatenate([cell.point_ids for cell in held]), own)
+    report = TileReport(tile, tuple(sums), reports, _flagged(result, images, rows), contradicted, result.converged, writes)
+    return TileUpdate(tile, sums, report)
 
 
 def _same_state(one: Cell, other: Cell) -> bool:

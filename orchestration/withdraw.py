@@ -14,8 +14,8 @@ from orchestration.progress import Reporter, Silent
 from submin.errors import InputError
 from submin.network.registration import together
 from submin.storage.catalogue_schema import CONTROL_PREFIX
-from submin.storage.control_blocks import control_block_id
-from submin.storage.ledger import Entry, Ledger
+from submin.storage.control_blocks import view_id
+from submin.storage.ledger import VIEWS, Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 from submin.storage.writer_lock import writing
 
@@ -47,6 +47,8 @@ def withdraw(
     reporter: Reporter | None = None,
 ) -> Withdrawn:  # fmt: skip
     """Withdraw one block, image or control point, by its id. It can come again.
+
+    Points that came with a joint covariance are one block: withdrawing one of them withdraws all, and the result says so.
 
     The last image of a block takes the block with it. A block of which an image was withdrawn stays in the ledger: the same block again
     is skipped, and brings the image back only after the whole block was withdrawn.
@@ -83,7 +85,8 @@ class _Leaving:
 def _leaving(base: Snapshot, kind: str, name: str) -> _Leaving:
     ledger = Ledger.of(base)
     table = base.image_columns(["image_id", "block_id", "withdrawn"])
-    block_id = ledger.block_of_image.get(name, "") if kind == "image" else control_block_id(name) if kind == "control point" else name
+    view = name if kind == "image" else view_id(name, 0)
+    block_id = name if kind == "block" else ledger.block_of_image.get(view, "")
     of_block = np.flatnonzero((table["withdrawn"] == 0) & (table["block_id"] == block_id))
     rows = of_block[table["image_id"][of_block] == name] if kind == "image" else of_block
     if kind == "image" and name.startswith(CONTROL_PREFIX):
@@ -98,6 +101,9 @@ def _leaving(base: Snapshot, kind: str, name: str) -> _Leaving:
 def _withdraw(where: str, version: int, leaving: _Leaving, executor: Executor, reporter: Reporter) -> Withdrawn:
     session, base = begin_change(where, version)
     rows, before, what = leaving.rows, leaving.before, f"{leaving.kind} {leaving.name}"
+    surveyed = before.kind != "images"
+    if leaving.kind == "control point" and len(rows) > VIEWS:
+        what += f" and the {len(rows) // VIEWS - 1} points that its errors are correlated with (block {before.block_id})"
     out = take_points_seen(base, rows.astype(np.int32))
     move = place(base, out, together([]), [])
     settled = settle(session, base, move, executor, reporter)
@@ -108,4 +114,4 @@ def _withdraw(where: str, version: int, leaving: _Leaving, executor: Executor, r
         entry = replace(left, reason=", ".join([before.reason or "without image", leaving.name]).replace("image, ", "image "))
     finish(session, base, move, settled, [], [entry], f"{what} withdrawn", withdrawn=rows.tolist())
     tiles = tuple(move.cover.tile_name(report.tile) for report in settled.reports)
-    return Withdrawn(f"v{version + 1}", what, 0 if leaving.kind == "control point" else len(rows), out.lost, tiles)
+    return Withdrawn(f"v{version + 1}", what, 0 if surveyed else len(rows), out.lost, tiles)

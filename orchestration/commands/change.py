@@ -112,12 +112,14 @@ def run(
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter, innovation=innovation)
     lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
+    if result.control_fused or result.observations_fused:
+        lines.append(f"{result.control_fused} control points and {result.observations_fused} clusters of observed positions added")
     if result.rays_used:
         lines.append(
             f"{result.rays_used:,} rays used, {result.rays_rejected:,} rejected as blunders, RMS {result.ray_rms_px:.3f} px; "
             f"{result.seconds:.1f} s, {result.peak_memory_mb:.0f} MB"
         )
-    if not result.fused and not result.rejected:
+    if not (result.fused or result.control_fused or result.observations_fused or result.rejected):
         lines[0] = f"{network} {result.version}: nothing is left to do, all {result.skipped} blocks are in the network"
     lines += [f"bad camera {f.image_id}: {f.reason}" for f in result.flagged]
     lines += [
@@ -125,6 +127,7 @@ def run(
         f"(probability {d.test.probability:.1e}); it was fused"
         for d in result.doubtful
     ]
+    lines += [f"not used: {c.reason}" for c in result.contradicted]
     lines += [f"rejected block {r.block_id}: {r.reason}" for r in result.rejected]
     lines += [f"tile {t}: the judgement of its rays did not settle; they are used as last judged" for t in result.unsettled_tiles]
     show(result.to_json(), as_json, "\n".join(lines))
@@ -159,7 +162,7 @@ def _run_dense(catalogue: Catalogue, network: str, batch_blocks: int, as_json: b
 @control_app.command("add")
 def control_add(
     network: Annotated[str, typer.Argument(help="Network that takes them.")],
-    points: Annotated[Path, typer.Argument(help="Table of surveyed points with their covariance or sigmas.")],
+    points: Annotated[Path, typer.Argument(help="Table of surveyed points with their covariance or sigmas, or a joint covariance.")],
     workers: Workers = 0,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -185,8 +188,9 @@ def control_add(
         f"{network} {added.version}: {added.fused} control points added, {added.skipped} already there, {len(added.rejected)} rejected"
     ]
     lines += [f"rejected {r.point_id}: {r.reason}" for r in added.rejected]
+    lines += [f"not used: {c.reason}" for c in added.contradicted]
     show(added.to_json(), as_json, "\n".join(lines))
-    if added.rejected:
+    if added.rejected or added.contradicted:
         raise typer.Exit(1)
 
 
@@ -195,7 +199,7 @@ def withdraw(
     network: Annotated[str, typer.Argument(help="Network to withdraw from.")],
     block: Annotated[str | None, typer.Option("--block", help="Id of a block, with all its images.")] = None,
     image: Annotated[str | None, typer.Option("--image", help="Id of one image; the rest of its block stays.")] = None,
-    control: Annotated[str | None, typer.Option("--control", help="Id of a control point.")] = None,
+    control: Annotated[str | None, typer.Option("--control", help="Id of a control point; correlated ones leave together.")] = None,
     workers: Workers = 0,
     scheduler: Scheduler = None,
     as_json: Json = False,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.blunders import (
+    TESTABLE,
     bad_cameras,
     deserted_image,
     image_statistics,
@@ -19,6 +20,7 @@ from submin.adjustment.blunders import (
     reject_blunders,
     residuals,
     robust_weights,
+    worst_of_sets,
 )
 from submin.adjustment.elimination import (
     LinearRays,
@@ -180,7 +182,11 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
             break
 
     weight = (weight > 0.05).astype(np.float64)
-    released, adjustable = np.zeros(len(images), dtype=bool), (images.prior_variance > 0.0).any(axis=1)
+    # correlated control has shifts and no camera: a shift that is wrong is one of its rays, and these are tested
+    camera = np.array([prior.a_priori is not None for prior in images.priors], dtype=np.bool_)
+    released, adjustable = np.zeros(len(images), dtype=bool), camera & (images.prior_variance > 0.0).any(axis=1)
+    of_set = _sets(images)[rays.image]
+    testable = TESTABLE * np.array([1.0 if prior.joint is None else prior.joint.part for prior in images.priors])[rays.image]
     image_statistic, statistic = np.zeros(len(images)), np.zeros(len(rays))
     converged, judgements, last, before, judged, sure = False, 0, state, weight, weight, False
     while not converged and judgements < MAX_ITERATIONS:
@@ -195,8 +201,9 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         judgeable = np.where(state.seen, candidates if judgements <= FREE_DECISIONS else weight, 0.0)
         if not (sure and moved < NEAR_ENOUGH_SIGMAS and _farthest(last, state, weight) < NEAR_ENOUGH_SIGMAS):
             doubt = step.noise if moved < NEAR_SIGMAS else 0.0
-            judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, doubt, weight)
-        worst = image_statistics(theta, covariance, images.prior_variance)
+            judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, doubt, weight, testable)
+            judged = worst_of_sets(judged, weight, statistic, of_set, rays.point)
+        worst = image_statistics(theta, covariance, np.where(camera[:, None], images.prior_variance, 0.0))
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         restless = judgements % PATIENCE == 0 and np.count_nonzero(judged != weight) > RESTLESS * len(rays)
@@ -227,6 +234,12 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         status = diagnose(state.linear, weight, shift, weight != before, iteration, tolerance * CONVERGED_SIGMAS)
     final = residuals(state.linear, weight, state.theta)
     return Adjustment(state.theta, state.ground, weight > 0.0, statistic, released, image_statistic, final, status)
+
+
+def _sets(images: ImageSet) -> NDArray[np.int64]:
+    """Number (m,) of the set of correlated control that each image is a view of; -1 for all others."""
+    names: dict[str, int] = {}
+    return np.array([-1 if p.joint is None else names.setdefault(p.block_id, len(names)) for p in images.priors], dtype=np.int64)
 
 
 def _to_release(

@@ -79,8 +79,9 @@ def residuals(linear: LinearRays, weight: Array, theta: Array) -> Array:
 
 
 def reject_blunders(
-    linear: LinearRays, weight: Array, theta: Array, covariance: Array, noise: float = 1.0, used: Array | None = None
-) -> tuple[Array, Array]:
+    linear: LinearRays, weight: Array, theta: Array, covariance: Array, noise: float = 1.0, used: Array | None = None,
+    testable: Array | None = None,
+) -> tuple[Array, Array]:  # fmt: skip
     """Weights (r,) of the rays, 0 for blunders, and the test statistic (r,) of each, at an adjustment of the images.
 
     Parameters
@@ -89,6 +90,7 @@ def reject_blunders(
     theta, covariance : (m, p), (m p, m p), corrections of the images and their a posteriori covariance, both triangles
     noise : variance of the measurements in units of the stated one, see `noise_bound`; 0 when the likeliest explanation is to be taken
     used : (r,) 1 for the rays with which the images were adjusted; by default those that are tested
+    testable : (r,) part of a ray's variance that others must check for it to be tested, by default `TESTABLE`
 
     Notes
     -----
@@ -97,9 +99,29 @@ def reject_blunders(
     judged, statistic = weight.copy(), np.zeros(len(weight))
     snoop(
         linear.first, linear.image, judged, weight if used is None else used, linear.by_ground, linear.by_parameters, linear.y,
-        theta, covariance, CRITICAL_RAY, DOUBT * noise, TESTABLE, statistic,
+        theta, covariance, CRITICAL_RAY, DOUBT * noise, np.full(len(weight), TESTABLE) if testable is None else testable, statistic,
     )  # fmt: skip
     return judged, statistic
+
+
+def worst_of_sets(judged: Array, used: Array, statistic: Array, of_set: NDArray[np.integer], point: Index) -> Array:
+    """Weights (r,) of the rays when of each set of correlated points only the worst of those that fail goes.
+
+    One bad point makes those correlated with it look bad, so only the worst is left out before all are judged again. Points that were
+    left out before stay as they are judged.
+
+    Parameters
+    ----------
+    judged, used : (r,) weights as judged, and those with which the images were adjusted; statistic : (r,) test statistics
+    of_set : (r,) number of the set of each survey's ray, -1 of all others; point : (r,)
+    """
+    lost = np.flatnonzero((of_set >= 0) & (used > 0.0) & ~(judged > 0.0))
+    spared = judged.copy()
+    for number in np.unique(of_set[lost]).tolist():
+        members = lost[of_set[lost] == number]
+        others = members[point[members] != point[members[np.argmax(statistic[members])]]]
+        spared[others] = used[others]
+    return spared
 
 
 def noise_bound(chi_square: float, redundancy: int) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from submin.adjustment.joint_errors import marginal_factor
 from submin.errors import InputError
 from submin.sensors.base import Parameter
 
@@ -196,11 +197,26 @@ def _uncertainty(name: str, values: Mapping[str, Any]) -> Uncertainty:
         raise InputError(f"priors: parameters: {name!r}: {str(error).removeprefix('priors: ')}") from None
 
 
+@dataclass(frozen=True, eq=False)
+class JointRows:
+    """A priori model of a view of a point with a full covariance: its rows of the factor that its set has in common.
+
+    Attributes
+    ----------
+    rows : (k, q) of the set's factor C (`submin.adjustment.joint_errors`), a row for each of the view's first k parameters
+    part : of the variance that a coordinate has when all others are known, what its ray has
+    """
+
+    rows: Array
+    part: float
+
+
 @dataclass(frozen=True)
 class ImagePrior:
-    """What the a priori factor needs to know of one image; ``a_priori`` is None when it has nothing to adjust.
+    """What the a priori factor needs to know of one image; ``a_priori`` is None when it has no camera to adjust.
 
-    ``parameters`` are those of its sensor, the first ones of the image's parameters.
+    ``parameters`` are those of its sensor, the first ones of the image's parameters. ``joint`` is the model of a view of correlated
+    control instead; views of one block are of one set.
     """
 
     block_id: str
@@ -209,6 +225,7 @@ class ImagePrior:
     a_priori: APriori | None
     parameters: tuple[Parameter, ...]
     released: bool = False
+    joint: JointRows | None = field(default=None, compare=False, repr=False)
 
 
 def correlation_factor(correlation: Array) -> Array:
@@ -221,14 +238,18 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     """Factor ``K`` (m p, q) of the a priori covariance of m images with p parameters each, image-major.
 
     Columns are whitened vectors: one for every image and adjustable parameter (its block's own parts), image-major, and one for every pass
-    and parameter that its images share. An image without a priori model has none: its parameters are zero, as are those that its sensor
-    does not have. Images may be any subset of a network: ``K K'`` is then the marginal of the whole prior.
+    and parameter that its images share; then those of each set of correlated control. An image without a priori model has none: its
+    parameters are zero, as are those that its sensor does not have. Images may be any subset of a network: ``K K'`` is then the marginal
+    of the whole prior.
     """
     m, p, columns = len(images), parameters, 0
+    sets: dict[str, list[int]] = {}
     own_column: dict[tuple[int, int], int] = {}
     blocks: dict[tuple[str, tuple[Parameter, ...]], list[int]] = {}
     shared: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for i, image in enumerate(images):
+        if image.joint is not None:
+            sets.setdefault(image.block_id, []).append(i)
         if image.a_priori is not None:
             blocks.setdefault((image.block_id, image.parameters), []).append(i)
             for c, parameter in enumerate(image.parameters):
@@ -259,7 +280,14 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     for k, members_of_pass in enumerate(shared.values()):
         rows, sigmas = zip(*members_of_pass, strict=True)
         entries.add(np.array(rows), np.array([columns + k]), np.array(sigmas)[:, None])
-    return entries.factor((m * p, columns + len(shared)))
+    columns += len(shared)
+    for members in sets.values():
+        views = [(i, joint.rows) for i in members if (joint := images[i].joint) is not None]
+        factor = marginal_factor(np.concatenate([rows for _, rows in views]))
+        at = np.concatenate([i * p + np.arange(len(rows)) for i, rows in views])
+        entries.add(at, columns + np.arange(factor.shape[1]), factor)
+        columns += factor.shape[1]
+    return entries.factor((m * p, columns))
 
 
 def prior_variance(prior: sp.csr_array, parameters: int) -> Array:

@@ -32,11 +32,11 @@ TIE = 1e-9
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _leave_out(variance: Array, residual: Array, rays: Offsets, size: int, n: int, testable: float) -> tuple[float, float]:
+def _leave_out(variance: Array, residual: Array, rays: Offsets, size: int, n: int, testable: Array) -> tuple[float, float]:
     """Leave rays ``rays[:size]`` out of the n that have these residuals (2 n) of this covariance (2 n, 2 n); both are changed.
 
-    Returns the drop of the weighted squares and the largest w of what is left. A direction that nothing checks (variance below
-    ``testable``) does not count.
+    Returns the drop of the weighted squares and the largest w of what is left. A direction that nothing checks (variance below the
+    ``testable`` (n) of its ray) does not count.
     """
     drop, left = 0.0, np.ones(2 * n, np.bool_)
     for k in range(size):
@@ -45,10 +45,10 @@ def _leave_out(variance: Array, residual: Array, rays: Offsets, size: int, n: in
         pivot = 2 * rays[0]
         for k in range(size):
             for c in range(2 * rays[k], 2 * rays[k] + 2):
-                if variance[c, c] > variance[pivot, pivot]:
+                if variance[c, c] * testable[pivot // 2] > variance[pivot, pivot] * testable[c // 2]:
                     pivot = c
         free = variance[pivot, pivot]
-        if not free >= testable:
+        if not free >= testable[pivot // 2]:
             break
         drop += residual[pivot] ** 2 / free
         for i in range(2 * n):
@@ -61,7 +61,7 @@ def _leave_out(variance: Array, residual: Array, rays: Offsets, size: int, n: in
             variance[i, pivot] = variance[pivot, i] = 0.0
     worst = 0.0
     for i in range(2 * n):
-        if left[i] and variance[i, i] >= testable:
+        if left[i] and variance[i, i] >= testable[i // 2]:
             worst = max(worst, abs(residual[i]) / np.sqrt(variance[i, i]))
     return drop, worst
 
@@ -75,7 +75,7 @@ def _choices(n: int, k: int) -> int:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def explain(variance: Array, residual: Array, n: int, critical: float, doubt: float, testable: float, blunder: NDArray[np.bool_]) -> None:
+def explain(variance: Array, residual: Array, n: int, critical: float, doubt: float, testable: Array, blunder: NDArray[np.bool_]) -> None:
     """Mark in ``blunder`` (n) the rays of a point that fails its test that go.
 
     ``residual`` (2 n) and ``variance`` (2 n, 2 n) are those of its n rays; an explanation whose squares are larger than the best one's by
@@ -241,10 +241,11 @@ def _along(basis: Array, free: int, k: int, t: Array, e: Array) -> None:
 @numba.njit(cache=True, error_model="numpy")
 def snoop(
     first: Offsets, image: Index, weight: Array, used: Array, by_ground: Array, by_parameters: Array, y: Array,
-    theta: Array, covariance: Array, critical: float, doubt: float, testable: float, statistic: Array,
+    theta: Array, covariance: Array, critical: float, doubt: float, testable: Array, statistic: Array,
 ) -> None:  # fmt: skip
     """Test the rays of each point by itself, reject its blunders, and test again until nothing fails.
 
+    A coordinate is tested when the variance of its residual is at least ``testable`` (r,), in that of its ray.
     Changes ``weight``; ``statistic`` (r,) becomes each ray's last w. ``used`` (r,) is above 0 for the rays with which the images were
     adjusted: a test must not depend on them, or a ray that moves its image far would be taken back and rejected in turn.
     """
@@ -252,7 +253,7 @@ def snoop(
     most = most_rays(first)
     rays, root, rays2, root2 = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
-    r, pivot, blunder = np.empty((3, 3)), np.empty(3, np.int32), np.empty(most, np.bool_)
+    r, pivot, blunder, limit = np.empty((3, 3)), np.empty(3, np.int32), np.empty(most, np.bool_), np.empty(most)
     basis, inner, variance = np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most))
     basis2, inner2, e, e2 = np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most)), np.empty(2 * most), np.empty(2 * most)
     z, z2, product, nearby = (
@@ -291,7 +292,7 @@ def snoop(
             worst = 0.0
             for k in range(2 * n):
                 own = residual_covariance(basis, inner, free, k, k)
-                w = abs(t[k]) / np.sqrt(own) if own >= testable else 0.0
+                w = abs(t[k]) / np.sqrt(own) if own >= testable[rays[k // 2]] else 0.0
                 statistic[rays[k // 2]] = w if k % 2 == 0 else max(statistic[rays[k // 2]], w)
                 worst = max(worst, w)
             if not worst > critical:
@@ -299,7 +300,9 @@ def snoop(
             for k in range(2 * n):
                 for i in range(2 * n):
                     variance[k, i] = residual_covariance(basis, inner, free, k, i)
-            explain(variance, t, n, critical, doubt, testable, blunder)
+            for a in range(n):
+                limit[a] = testable[rays[a]]
+            explain(variance, t, n, critical, doubt, limit, blunder)
             for a in range(n):
                 if blunder[a]:
                     weight[rays[a]] = 0.0

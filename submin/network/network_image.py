@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.images import ImageSet
-from submin.adjustment.priors import APriori, ImagePrior
+from submin.adjustment.priors import APriori, ImagePrior, JointRows
+from submin.errors import StoreError
 from submin.geodesy import Ellipsoid
 from submin.sensors import sensor_named
 
@@ -26,8 +27,9 @@ class NetworkImage:
     camera : catalogue description, JSON text
     width, height : pixels
     seconds : time of acquisition, seconds since 1970; NaN when unknown
-    a_priori : JSON text of the a priori model of its block; empty for an image that has nothing to adjust
+    a_priori : JSON text of the a priori model of its block, or of its `JointPlace`; empty for an image that has nothing to adjust
     released : True once its camera was found to be bad and its prior given up
+    joint : rows of a common factor, of a view of correlated control
     """
 
     image_id: str
@@ -40,6 +42,34 @@ class NetworkImage:
     seconds: float
     a_priori: str
     released: bool = False
+    joint: JointRows | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class JointPlace:
+    """Where the a priori model of a view of correlated control is kept.
+
+    Attributes
+    ----------
+    record : name of the factor of its set; first, rows : its rows of it; part : see `JointRows`
+    """
+
+    record: str
+    first: int
+    rows: int
+    part: float
+
+    def to_text(self) -> str:
+        """What the image's ``a_priori`` holds."""
+        return json.dumps({_JOINT: asdict(self)})
+
+    @classmethod
+    def from_text(cls, a_priori: str) -> JointPlace | None:
+        """The place that an image's ``a_priori`` names, or None."""
+        return cls(**json.loads(a_priori)[_JOINT]) if a_priori.startswith(f'{{"{_JOINT}"') else None
+
+
+_JOINT = "joint"
 
 
 @lru_cache(maxsize=4096)
@@ -49,7 +79,16 @@ def _packed(sensor: str, camera: str, width: int, height: int) -> NDArray[np.flo
 
 @lru_cache(maxsize=256)
 def _a_priori(text: str) -> APriori | None:
-    return APriori.from_mapping(json.loads(text)) if text else None
+    return APriori.from_mapping(json.loads(text)) if text and JointPlace.from_text(text) is None else None
+
+
+def _prior(image: NetworkImage) -> ImagePrior:
+    if image.joint is None and JointPlace.from_text(image.a_priori) is not None:
+        raise StoreError(f"image {image.image_id} has lost its part of a joint covariance; the store is damaged")
+    return ImagePrior(
+        image.block_id, image.pass_id, image.seconds, _a_priori(image.a_priori), sensor_named(image.sensor).parameters, image.released,
+        image.joint,
+    )  # fmt: skip
 
 
 def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: int) -> ImageSet:
@@ -64,7 +103,5 @@ def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: 
     packed = np.full((len(images), max((len(c) for c in cameras), default=0)), np.nan)
     for row, camera in zip(packed, cameras, strict=True):
         row[: len(camera)] = camera
-    priors = tuple(
-        ImagePrior(i.block_id, i.pass_id, i.seconds, _a_priori(i.a_priori), sensor_named(i.sensor).parameters, i.released) for i in images
-    )
+    priors = tuple(_prior(i) for i in images)
     return ImageSet(tuple(i.image_id for i in images), tuple(i.sensor for i in images), packed, priors, parameters, ellipsoid)

@@ -8,11 +8,14 @@ from submin.sensors.frame import FrameSensor
 from submin.sensors.height import HeightSensor
 from submin.sensors.pushbroom import PushbroomSensor
 from submin.sensors.rpc import RpcSensor
-from submin.sensors.survey import SurveySensor
+from submin.sensors.survey import SHIFTS, SurveySensor
 
 SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor for sensor in (RpcSensor(), PushbroomSensor(), FrameSensor(), SurveySensor(), HeightSensor())
+    sensor.name: sensor
+    for sensor in (RpcSensor(), PushbroomSensor(), FrameSensor(), SurveySensor(), SurveySensor("survey set", SHIFTS), HeightSensor())
 }
+SURVEYS = ("survey", "survey set")
+"""Sensors of control: of a point by itself, and of one of a set of correlated points."""
 
 
 def width_of(sensors: Iterable[str]) -> int:
@@ -28,4 +31,4 @@ def sensor_named(name: str) -> Sensor:
         raise InputError(f"sensor is {name!r}; expected one of {', '.join(sorted(SENSORS))}") from None
 
 
-__all__ = ["SENSORS", "Ground", "Parameter", "Projection", "Sensor", "sensor_named", "width_of"]
+__all__ = ["SENSORS", "SURVEYS", "Ground", "Parameter", "Projection", "Sensor", "sensor_named", "width_of"]

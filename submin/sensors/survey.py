@@ -2,7 +2,8 @@
 
 A control point is one more observation of a ground point, with no image parameters (docs/mathematics.md, "Sources"). Its three
 coordinates, along the principal axes of their covariance and thereby uncorrelated, are two views of two axes each; the second axis of
-the second view is zero and observes nothing.
+the second view is zero and observes nothing. A point whose errors are correlated with those of others has shifts along these axes, which
+are parameters of its views (docs/mathematics.md, "Points with a full covariance").
 """
 
 from __future__ import annotations
@@ -22,17 +23,22 @@ Index = NDArray[np.int32]
 
 _ORIGIN, _AXES, _PLACE = slice(0, 3), slice(3, 9), slice(9, 12)
 
+SHIFTS = tuple(Parameter(f"shift along the {which} axis", "m", "shift", 0.0) for which in ("first", "second"))
+"""Errors of a surveyed point that others share; what is believed of them is stated for a set of points, not by a sigma."""
+
 
 class SurveySensor:
-    """A view of a surveyed point.
+    """A view of a surveyed point, by itself (no parameters) or of a set of correlated ones (`SHIFTS`).
 
     The camera is a mapping with ``origin`` (3 geocentric coordinates, metres), ``axes`` (two rows of 3, geocentric) and ``place``
     (longitude and latitude in degrees, height in metres).
     """
 
-    name = "survey"
     unit = "metre"
-    parameters: tuple[Parameter, ...] = ()
+
+    def __init__(self, name: str = "survey", parameters: tuple[Parameter, ...] = ()) -> None:
+        self.name = name
+        self.parameters = parameters
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
         """See `Sensor.pack`."""
@@ -48,7 +54,11 @@ class SurveySensor:
         """See `Sensor.project`."""
         axes = np.ascontiguousarray(cameras[image, _AXES]).reshape(-1, 2, 3)
         along = np.einsum("rck,rk->rc", axes, ground.geocentric[point] - cameras[image, _ORIGIN])
-        return Projection(along, axes, np.zeros((len(image), 2, 0)))
+        by_parameters = np.zeros((len(image), 2, len(self.parameters)))
+        for k in range(len(self.parameters)):
+            by_parameters[:, k, k] = axes[:, k].any(axis=1)  # an axis of zeros observes no shift
+            along[:, k] += by_parameters[:, k, k] * parameters[image, k]
+        return Projection(along, axes, by_parameters)
 
     def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
         """The surveyed place of each view, whatever the height."""
@@ -57,3 +67,13 @@ class SurveySensor:
     def mean_height(self, cameras: Array) -> Array:
         """See `Sensor.mean_height`."""
         return np.asarray(cameras[:, _PLACE.stop - 1])
+
+
+def surveyed_axes(cameras: Array) -> Array:
+    """Axes (m, 2, 3) of packed views (m, c), geocentric; an axis of zeros observes nothing."""
+    return np.ascontiguousarray(cameras[:, _AXES]).reshape(-1, 2, 3)
+
+
+def surveyed_place(cameras: Array) -> tuple[Array, Array]:
+    """Geocentric and geodetic coordinates (m, 3) of the points of packed views (m, c), as surveyed."""
+    return np.asarray(cameras[:, _ORIGIN]), np.asarray(cameras[:, _PLACE])

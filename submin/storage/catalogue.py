@@ -37,7 +37,7 @@ from submin.formats.columns import (
     text_values,
 )
 from submin.network.observations import Cluster
-from submin.sensors import SENSORS
+from submin.sensors import SENSORS, SURVEYS
 from submin.storage.catalogue_schema import (
     CONTROL_PREFIX,
     DEFAULT_SIGMA_PX,
@@ -317,9 +317,9 @@ def _read_images(path: Path) -> tuple[ImageRecord, ...]:
         record["footprint"] = record.pop("geometry") or b""
         try:
             image = ImageRecord(**record)
-            if image.sensor in SENSORS and not SENSORS[image.sensor].parameters:  # views that the program makes itself
-                of_images = ", ".join(name for name, sensor in SENSORS.items() if sensor.parameters)
-                raise InputError(f"sensor is {image.sensor!r}, which is none of images; expected one of {of_images}")
+            of_images = [name for name, sensor in SENSORS.items() if sensor.parameters and name not in SURVEYS]
+            if image.sensor in SENSORS and image.sensor not in of_images:  # views that the program makes itself
+                raise InputError(f"sensor is {image.sensor!r}, which is none of images; expected one of {', '.join(of_images)}")
         except InputError as error:
             raise CatalogueError(f"{path}: row {row}: {error}") from None
         if image.image_id in first_row:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from submin.adjustment.joint_errors import JointErrors
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
 from submin.geodesy import WGS84, Ellipsoid
@@ -38,6 +39,7 @@ COVARIANCE_COLUMNS = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu"
 SIGMA_COLUMNS = ("sigma_e", "sigma_n", "sigma_u")
 CONTROL_PREFIX = "control:"
 """Begins the block and image ids of control points; no catalogue may use it."""
+BLOCK_KINDS = ("images", "control", "observations")
 POINT_KINDS = ("control", "check", "truth")
 
 _COMPACT_UTC = re.compile(r"(\d{14})(\.\d+)?")
@@ -245,6 +247,8 @@ class Block:
     sample, line : (r,) measured image coordinates, pixels
     sigma_sample, sigma_line : (r,) their standard deviations, pixels
     content : what the block is made of, where that is not images and rays as they are: identifies it instead of them
+    kind : one of `BLOCK_KINDS`
+    joint : covariance of the shifts of its views, view by view, where it is one of correlated points
     source, first_row : file that holds the rays, and its row of the first one, for messages; empty when they come from no file
     """
 
@@ -260,6 +264,8 @@ class Block:
     content: str = ""
     source: str = ""
     first_row: int = 1
+    kind: str = "images"
+    joint: JointErrors | None = None
 
     def __post_init__(self) -> None:
         shapes = {name: np.shape(getattr(self, name)) for name in ("point_ids", "image", *_MEASURED)}

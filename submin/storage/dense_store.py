@@ -67,16 +67,14 @@ class Member:
         """Name in the ledger."""
         return self.cluster.cluster_id
 
+    @property
+    def point_ids(self) -> tuple[str, ...]:
+        """The points concerned, ascending."""
+        return tuple(self.cluster.point_ids.tolist())
+
     def content_hash(self) -> str:
         """Hexadecimal BLAKE2b of the observations and their covariance."""
-        digest = hashlib.blake2b(self.stated.encode(), digest_size=32)
-        if self.stated:
-            return digest.hexdigest()
-        for text in (self.cluster.from_ids, self.cluster.to_ids):
-            digest.update(SEPARATOR.join(text.tolist()).encode() + b"\0")
-        for values in (self.cluster.values, np.tril(self.cluster.covariance)):
-            digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
-        return digest.hexdigest()
+        return hashlib.blake2b(self.stated.encode(), digest_size=32).hexdigest() if self.stated else self.cluster.content_hash()
 
 
 def create_dense(root: zarr.Group) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.query.point_metadata import ImageFacts
-from submin.storage.catalogue_schema import CONTROL_PREFIX
+from submin.sensors import SURVEYS
 from submin.storage.network_store import Snapshot
 
 
@@ -20,14 +20,14 @@ def image_facts(snapshot: Snapshot) -> ImageFacts:
     order = np.lexsort((blocks, _versions(snapshot, blocks)))
     times, acquired = _codes(table["seconds"], table["acquired"], np.isfinite(table["seconds"]))
     licences, licence = _codes(table["licence"], table["licence"], table["licence"] != "")
-    return ImageFacts(table["sensor"] == "survey", np.argsort(order)[of_image], blocks[order], acquired, times, licence, licences)
+    return ImageFacts(np.isin(table["sensor"], SURVEYS), np.argsort(order)[of_image], blocks[order], acquired, times, licence, licences)
 
 
 def _versions(snapshot: Snapshot, blocks: NDArray[np.str_]) -> NDArray[np.int64]:
     """Version (k,) in which each of some blocks came; 0 where the ledger does not say."""
-    ledger = snapshot.ledger(["block_id", "status", "reason", "version"])
+    ledger = snapshot.ledger(["block_id", "status", "reason", "version", "kind"])
     # a line of a fused block with a reason tells of an image that has left it
-    came = (ledger["status"] == "fused") & (ledger["reason"] == "") & ~np.char.startswith(ledger["block_id"], CONTROL_PREFIX)
+    came = (ledger["status"] == "fused") & (ledger["reason"] == "") & (ledger["kind"] == "images")
     versions = np.zeros(len(blocks), dtype=np.int64)
     known = np.isin(ledger["block_id"], blocks) & came
     np.maximum.at(versions, np.searchsorted(blocks, ledger["block_id"][known]), ledger["version"][known])

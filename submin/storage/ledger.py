@@ -11,11 +11,13 @@ import zarr
 
 from submin.storage.arrays import append_table
 from submin.storage.catalogue_schema import Block, defects
-from submin.storage.control_blocks import control_point_of
+from submin.storage.control_blocks import point_of_view, points_of
 from submin.storage.network_store import Snapshot
 
 UNTESTED = (0.0, 0, 1.0, 0, -1)
-"""The last columns of a line of a block that was not tested: nothing of it was in the network."""
+"""The columns of a test in a line of a block that was not tested: nothing of it was in the network."""
+VIEWS = 2
+"""Images that a surveyed point has."""
 _MEASURED = re.compile(r"\d+\.\d+|\bv\d+\b")
 
 
@@ -25,7 +27,7 @@ class Entry:
 
     Attributes
     ----------
-    block_id : the block; ``control:ID`` for a control point
+    block_id : the block; ``control:ID`` for a control point, ``control:set:...`` for a set of correlated ones
     content : hash of what came, see `Block.content_hash`; empty for a rejected block
     status : ``fused``, ``rejected`` or ``withdrawn``
     reason : why it was rejected, or which images are withdrawn from it
@@ -33,6 +35,7 @@ class Entry:
     images, rays, rays_rejected : what the network has of the block
     d2, dof, probability, left_out, against : test by the network when the block came (`submin.network.innovation.BlockTest`): statistic,
         degrees of freedom, probability, common points left out, and number of the version; `UNTESTED` where nothing was in common
+    kind : of the block, one of `BLOCK_KINDS`
     """
 
     block_id: str
@@ -48,6 +51,7 @@ class Entry:
     probability: float = 1.0
     left_out: int = 0
     against: int = -1
+    kind: str = "images"
 
 
 def append_entries(ledger: zarr.Group, entries: Sequence[Entry]) -> None:
@@ -97,14 +101,18 @@ class Ledger:
 
     def refusal(self, block: Block) -> str | None:
         """Why a block that is not the same as before cannot come in, or None."""
-        control = control_point_of(block.block_id)
         if block.block_id in self._content:
-            if control is not None:
-                return (
-                    f"control point {control} is already in the network with other values; withdraw it first ('submin withdraw --control')"
-                )
+            if block.kind == "control":
+                what = f"control point {block.point_ids[0]}" if block.joint is None else f"set of {len(points_of(block))} control points"
+                return f"{what} is already in the network with other values; withdraw it first ('submin withdraw --control')"
             return f"block {block.block_id} is already in the network with other content; withdraw it first, or give the new one another id"
         for image in block.images:
+            point = point_of_view(image.image_id)
+            if image.image_id in self.block_of_image and point is not None:
+                return (
+                    f"point {point} is control of the network already, in block {self.block_of_image[image.image_id]}; "
+                    f"a survey counts once; withdraw that first ('submin withdraw --control {point}')"
+                )
             if image.image_id in self.block_of_image:
                 return f"image {image.image_id} already came in block {self.block_of_image[image.image_id]}; an image counts once"
         return defects(block)
@@ -120,9 +128,12 @@ class Ledger:
 
     def fused(self) -> tuple[Entry, ...]:
         """Blocks of images that are in the network."""
-        return tuple(e for e in self.entries.values() if e.status == "fused" and control_point_of(e.block_id) is None)
+        return tuple(e for e in self.entries.values() if e.status == "fused" and e.kind == "images")
 
     def control_points(self) -> tuple[str, ...]:
-        """Ids of the control points that are in the network."""
-        found = (control_point_of(e.block_id) for e in self.entries.values() if e.status == "fused")
-        return tuple(sorted(point for point in found if point is not None))
+        """Ids of the control points that are in the network, those of sets and of observed positions among them."""
+        return tuple(sorted({point for image in self.block_of_image if (point := point_of_view(image)) is not None}))
+
+    def control_sets(self) -> tuple[str, ...]:
+        """Blocks of points with a joint covariance that are in the network."""
+        return tuple(e.block_id for e in self.entries.values() if e.status == "fused" and e.kind != "images" and e.images > VIEWS)

@@ -32,6 +32,7 @@ from submin.storage.schema import (
     network_images,
     read_cell,
     read_sub_min,
+    with_joint,
 )
 from submin.tiling.cover import Cover
 
@@ -253,7 +254,7 @@ class Snapshot:
             [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")],
         )
         if rows is None:
-            return network_images(read_table(table, wanted))
+            return with_joint(self.root, network_images(read_table(table, wanted)))
         if not len(rows):
             return []
         wanted_rows = np.asarray(rows, dtype=np.int64)
@@ -262,7 +263,7 @@ class Snapshot:
         for run in np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1):
             span = network_images(read_table(table, wanted, int(run[0]), int(run[-1]) + 1))
             found.extend(span[int(row) - int(run[0])] for row in run)
-        return found
+        return with_joint(self.root, found)
 
     def image_columns(self, wanted: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns of the image table."""

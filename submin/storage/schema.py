@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,13 @@ import zarr
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import Sums
+from submin.adjustment.priors import JointRows
 from submin.adjustment.rays import Rays
 from submin.adjustment.symmetric import fill_symmetric
 from submin.errors import StoreError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, widened
-from submin.network.network_image import NetworkImage
+from submin.network.network_image import JointPlace, NetworkImage
 from submin.network.sub_min import SubMin, wider
 from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
@@ -32,8 +33,11 @@ IMAGE_COLUMNS = {
 LEDGER_COLUMNS = {
     "block_id": "text", "content": "text", "status": "text", "reason": "text", "version": "int64",
     "images": "int64", "rays": "int64", "rays_rejected": "int64",
-    "d2": "float64", "dof": "int64", "probability": "float64", "left_out": "int64", "against": "int64",
+    "d2": "float64", "dof": "int64", "probability": "float64", "left_out": "int64", "against": "int64", "kind": "text",
 }  # fmt: skip
+JOINT = "joint"
+"""Group of the factors of correlated control, a record by content (`JointPlace.record`); views that were withdrawn keep theirs."""
+JOINT_CHUNK = 256
 FLAG_COLUMNS = {"tile": "int64", "image": "int64"}
 """Which tile finds the camera of which image bad; the prior of an image is released while any tile says so."""
 DIRECTORY_COLUMNS = {"hash": "uint64", "cell": "int64"}
@@ -208,3 +212,34 @@ def network_images(columns: dict[str, NDArray[Any]]) -> list[NetworkImage]:
         NetworkImage(str(i), str(b), str(p), str(s), str(c), int(w), int(h), float(t), str(a), bool(r))
         for i, b, p, s, c, w, h, t, a, r in zip(*(columns[name] for name in names), strict=True)
     ]
+
+
+def write_joint(root: zarr.Group, images: Sequence[NetworkImage]) -> None:
+    """Write the factors of the sets of correlated control among some new images, all views of a set together."""
+    parts: dict[str, list[NDArray[np.float64]]] = {}
+    for image in images:
+        place = JointPlace.from_text(image.a_priori)
+        if place is not None and image.joint is not None:
+            parts.setdefault(place.record, []).append(image.joint.rows)
+    for record, rows in parts.items():
+        factor = np.concatenate(rows)
+        chunks = tuple(min(JOINT_CHUNK, length) for length in factor.shape)
+        root.require_group(JOINT).create_group(record, overwrite=True).create_array("factor", data=factor, chunks=chunks)
+
+
+def with_joint(root: zarr.Group, images: Sequence[NetworkImage]) -> list[NetworkImage]:
+    """Images with the rows of the factors that those of correlated control have in the store."""
+    places = [JointPlace.from_text(image.a_priori) for image in images]
+    factors = {}
+    for record in {place.record for place in places if place is not None}:
+        wanted = [place for place in places if place is not None and place.record == record]
+        first, stop = min(place.first for place in wanted), max(place.first + place.rows for place in wanted)
+        factors[record] = first, np.asarray(array_of(group_of(root, f"{JOINT}/{record}"), "factor")[first:stop])
+    return [
+        image if place is None else replace(image, joint=_rows_of(place, *factors[place.record]))
+        for image, place in zip(images, places, strict=True)
+    ]
+
+
+def _rows_of(place: JointPlace, first: int, factor: NDArray[np.float64]) -> JointRows:
+    return JointRows(factor[place.first - first : place.first - first + place.rows], place.part)

@@ -40,6 +40,7 @@ from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.run import run
 from submin.adjustment.warm_up import compile_kernels
+from submin.formats.tables import covariance_rows
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata
@@ -901,14 +902,29 @@ simply("retirement without a day", lambda w: retiring(w, "--reason", "quarry"))
 simply("retirement before the first day", lambda w: retiring(w, "--valid-from", "2026-06-01", "--valid-to", "2026-05-31"))
 
 
-@case("correlated control")
+def _correlated(w: World, covariance: Any, variance: float = 1.0) -> list[Any]:
+    """Two points with this joint covariance, and a variance beside it for the coordinates of each."""
+    points = Catalogue.open(w.catalogue).points("check")
+    columns = {"point_id": points.point_ids[:2]}  # type: ignore[union-attr]
+    columns |= {name: points.geodetic[:2, k] for k, name in enumerate(("longitude", "latitude", "height"))}  # type: ignore[union-attr]
+    columns |= {f"sigma_{axis}": np.full(2, np.sqrt(variance)) for axis in "enu"}
+    pq.write_table(pa.table(columns | {"covariance_row": covariance_rows(covariance, 0, 2)}), w.folder / "joint.parquet")
+    return ["control", "add", w.fused, w.folder / "joint.parquet"]
+
+
+@case("correlated control with a negative variance")
 def _(w: World) -> list[Any]:
-    network = w.fused
-    ids = Catalogue.open(w.catalogue).points("check").point_ids[:2]  # type: ignore[union-attr]
-    submin.open(network).query(points=ids).to_parquet(w.folder / "joint.parquet")
-    surveyed = pq.read_table(w.folder / "joint.parquet").drop_columns(["ce90", "le90", "tile", "rays"])
-    pq.write_table(surveyed, w.folder / "joint.parquet")
-    return ["control", "add", network, w.folder / "joint.parquet"]
+    return _correlated(w, np.kron([[1.0, 2.0], [2.0, 1.0]], np.eye(3)))
+
+
+@case("correlated control without a datum")
+def _(w: World) -> list[Any]:
+    return _correlated(w, np.kron(np.full((2, 2), 1e12) + np.eye(2), np.eye(3)), 1e12)
+
+
+@case("correlated control whose covariances contradict each other")
+def _(w: World) -> list[Any]:
+    return _correlated(w, np.eye(6), 2.0)
 
 
 @case("image id of a control point")

@@ -22,7 +22,6 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
 from submin.storage.control_blocks import control_blocks
-from submin.storage.network_store import Snapshot
 
 HERE = SerialExecutor()
 MOON = Ellipsoid(1737400.0, 0.0)
@@ -154,10 +153,3 @@ def test_control_elsewhere_is_refused(base: Path, region: SimulatedRegion) -> No
     (refused,) = add_control(far, "test", str(base), HERE).rejected
     assert "outside the area" in refused.reason
     assert len(submin.open(base).query(bbox=EVERYWHERE)) > 100
-
-
-def test_correlated_control_is_refused_before_anything_is_written(base: Path, control: PointTable) -> None:
-    joint = PointTable(control.point_ids, control.geodetic, control.covariance_enu, control.area, np.eye(3 * len(control)))
-    with pytest.raises(InputError, match="correlated control is not taken yet"):
-        add_control(joint, "survey.parquet", str(base), HERE)
-    assert Snapshot.open(str(base)).number == 1

@@ -403,6 +403,30 @@ def test_rays_that_meet_at_a_tiny_angle_stay_consistent(angle: float) -> None:
     assert worst_ratio(network, far(angle), full(eliminated(network)), by_observation) <= 1.0 + 1e-6
 
 
+def joined(parts: list[Network]) -> Network:
+    """Networks of the same images together; the second ray of every fifth point is rejected, so that the point is pending."""
+    by_ground, by_parameters, y, image = (
+        np.concatenate([getattr(part.linear, name) for part in parts]) for name in ("by_ground", "by_parameters", "y", "image")
+    )
+    weight = np.ones(len(image))
+    weight[1::10] = 0.0
+    return Network(LinearRays(np.arange(0, len(image) + 1, 2), image, by_ground, by_parameters, y), weight, parts[0].prior, parts[0].images)
+
+
+@pytest.mark.parametrize("angle", [1e-7, 1e-9])
+def test_tiny_angles_stay_consistent_among_pending_undetermined_and_sound_points(angle: float) -> None:
+    network = joined([weak_network(angle), weak_network(0.0), weak_network(0.3)])
+    linear = network.linear
+    by_observation = np.empty((network.images * P, linear.y.size))
+    for k in range(linear.y.size):
+        unit = np.zeros(linear.y.size)
+        unit[k] = 1.0
+        by_observation[:, k] = eliminate(replace(linear, y=unit.reshape(-1, 2)), network.weight, network.images).vector
+    rank = point_factors(linear, network.weight).rank
+    assert np.bincount(rank, minlength=4).tolist() == [0, 0, 12 + 16, 32]  # single rays and parallel ones; the others
+    assert worst_ratio(network, far(angle), full(eliminated(network)), by_observation) <= 1.0 + 1e-6
+
+
 @pytest.mark.parametrize("angle", [1e-3, 1e-5])
 def test_truncating_the_weak_direction_would_not_be_consistent(angle: float) -> None:
     network = weak_network(angle)
