@@ -25,7 +25,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
 from submin.network.innovation import BlockTest
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.sub_min import add_sums, factor
+from submin.network.sub_min import SubMin, add_sums, factor
 from submin.query.block_innovation import block_test, common_points
 from submin.sensors import sensor_named, width_of
 from submin.storage.network import Network
@@ -171,6 +171,14 @@ class BlockGate:
         self._networks: dict[int, Network] = {}
         self._passes: NDArray[np.str_] | None = None
         self._tile_images: dict[int, NDArray[np.int32]] = {}
+        self._latest: tuple[tuple[int, int], SubMin] | None = None
+
+    def _sub_min(self, parameters: int, tile: int) -> SubMin:
+        """A tile's sub-MIN; the latest one is kept, since neighbouring blocks ask for the same."""
+        if self._latest is None or self._latest[0] != (parameters, tile):
+            self._latest = None  # never two in memory
+            self._latest = (parameters, tile), self._network(parameters).sub_min(tile, None)
+        return self._latest[1]
 
     def _network(self, parameters: int) -> Network:
         """The network with so many parameters an image; the images of all cells that are asked for are read at once."""
@@ -193,7 +201,9 @@ class BlockGate:
         theta = np.zeros((len(images), p))
         theta[:, : adjusted.theta.shape[1]] = adjusted.theta
         try:
-            common = common_points(self._network(p), ids, cells, images, lambda tile: self._mates(tile, block))
+            common = common_points(
+                self._network(p), ids, cells, images, lambda tile: self._mates(tile, block), lambda tile: self._sub_min(p, tile)
+            )
             return None if common is None else block_test(common, images, ids, rays, replace(adjusted, theta=theta), start)
         except NumericalError:  # what cannot be computed is no reason against the block
             return None

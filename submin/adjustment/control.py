@@ -268,6 +268,35 @@ def _free(linear: LinearRays, weight: Array, prior: ControlledPrior) -> tuple[Ar
     return information, images.T @ (sums.vector - seen), misclosure, sums.redundancy
 
 
+def _controlled(
+    linear: LinearRays,
+    weight: Array,
+    prior: ControlledPrior,
+    active: Flags,
+    information: Array,
+    vector: Array,
+    misclosure: float,
+    redundancy: int,
+) -> tuple[Array, Array, float, int]:
+    """What the block says with its control: the innovation added, in place, to what `_free` has found."""
+    for part in _innovations(linear, weight, prior, active):
+        rows = part.design.reshape(-1, part.design.shape[2])
+        information += rows.T @ rows
+        vector += rows.T @ part.e.ravel()
+        misclosure += float((part.e**2).sum())
+        redundancy += int(part.rank.sum())
+    return information, vector, misclosure, redundancy
+
+
+def _minimum(information: Array, vector: Array, misclosure: float) -> tuple[Array, Array, float]:
+    """Cholesky factor of an information matrix, which it replaces, estimate of the whitened vectors, and weighted squares there."""
+    if not np.isfinite(vector).all():
+        raise NumericalError("the block's right-hand side is not finite; a camera or a measurement is not")
+    factor = cholesky(information) if len(information) else information
+    w = la.cho_solve((factor, True), vector, check_finite=False) if len(factor) else vector
+    return factor, w, float(misclosure - vector @ w)
+
+
 def estimate(linear: LinearRays, weight: Array, prior: ControlledPrior, active: Flags, origin: Array) -> ControlledEstimate:
     """Estimate images and points of a block from its linearised rays (weights (r,): 0 for rejected ones) and its prior state.
 
@@ -279,19 +308,10 @@ def estimate(linear: LinearRays, weight: Array, prior: ControlledPrior, active: 
     NumericalError
         When the information is not finite or not positive definite.
     """
-    information, vector, misclosure, redundancy = _free(linear, weight, prior)
-    for part in _innovations(linear, weight, prior, active):
-        rows = part.design.reshape(-1, part.design.shape[2])
-        information += rows.T @ rows
-        vector += rows.T @ part.e.ravel()
-        misclosure += float((part.e**2).sum())
-        redundancy += int(part.rank.sum())
-    if not np.isfinite(vector).all():
-        raise NumericalError("the block's right-hand side is not finite; a camera or a measurement is not")
-    factor = cholesky(information) if len(information) else information
-    w = la.cho_solve((factor, True), vector, check_finite=False) if len(factor) else vector
+    information, vector, misclosure, redundancy = _controlled(linear, weight, prior, active, *_free(linear, weight, prior))
+    factor, w, squares = _minimum(information, vector, misclosure)
     theta = prior.theta + (prior.images @ w).reshape(prior.theta.shape)
-    return _with_ground(linear, weight, prior, active, origin, factor, w, theta, (float(misclosure - vector @ w), redundancy))
+    return _with_ground(linear, weight, prior, active, origin, factor, w, theta, (squares, redundancy))
 
 
 def _with_ground(
@@ -354,7 +374,19 @@ def innovation_test(
 ) -> InnovationTest:
     """Test the control: by how much the weighted squares rise over those of the block free of it, which is ``nu' S^-1 nu``."""
     information, vector, misclosure, redundancy = _free(linear, weight, prior)
-    w = la.cho_solve((cholesky(information), True), vector, check_finite=False) if len(vector) else vector
-    d2 = max(controlled.chi_square - (misclosure - float(vector @ w)), 0.0)
-    dof = controlled.redundancy - redundancy
+    _, _, squares = _minimum(information, vector, misclosure)
+    return _test(controlled.chi_square - squares, controlled.redundancy - redundancy)
+
+
+def innovation_of(linear: LinearRays, weight: Array, prior: ControlledPrior, active: Flags) -> InnovationTest:
+    """The same test without an estimate of the points, at the linearisation of the rays."""
+    information, vector, misclosure, redundancy = _free(linear, weight, prior)
+    _, _, squares = _minimum(information.copy(), vector, misclosure)
+    information, vector, misclosure, together = _controlled(linear, weight, prior, active, information, vector, misclosure, redundancy)
+    _, _, controlled = _minimum(information, vector, misclosure)
+    return _test(controlled - squares, together - redundancy)
+
+
+def _test(rise: float, dof: int) -> InnovationTest:
+    d2 = max(rise, 0.0)
     return InnovationTest(d2, dof, float(chi2.sf(d2, dof)) if dof else 1.0)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from submin.adjustment.adjustment import Adjustment
-from submin.adjustment.control import ControlledPrior, covariance_factor, estimate, innovation_test
+from submin.adjustment.control import ControlledPrior, covariance_factor, innovation_of
 from submin.adjustment.controlled_adjustment import adjust_controlled
 from submin.adjustment.elimination import linearise
 from submin.adjustment.images import ImageSet
@@ -33,8 +33,8 @@ from submin.query.source import Index, NetworkSource
 Array = NDArray[np.float64]
 Ids = NDArray[np.str_]
 
-MOST_POINTS = 200
-"""Common points that are compared, well spread: systematic errors of a block show in few, and the work grows with their cube."""
+MOST_POINTS = 60
+"""Common points that are compared, well spread: systematic errors of a block show in few, and the work grows with their square or cube."""
 KNOWN = 1e-10
 """A direction of the pass-mates' a priori factor below this part of the largest is taken for unknown."""
 
@@ -88,11 +88,12 @@ class CommonPoints:
 
 
 def common_points(
-    source: NetworkSource, ids: Ids, cells: NDArray[np.int64], block: ImageSet, mates_in: Callable[[int], Index]
-) -> CommonPoints | None:
+    source: NetworkSource, ids: Ids, cells: NDArray[np.int64], block: ImageSet, mates_in: Callable[[int], Index],
+    sub_min: Callable[[int], SubMin],
+) -> CommonPoints | None:  # fmt: skip
     """What one tile says of a block's points ``ids`` (in ``cells``, see `points_named`); None without any determined one.
 
-    ``mates_in`` gives the rows of a tile's images that share a pass with an image of the block.
+    ``mates_in`` gives the rows of a tile's images that share a pass with an image of the block, ``sub_min`` a tile's sub-MIN.
     """
     selections, _ = points_named(source, ids, cells)
     tile = _tile_of_most(source, selections)
@@ -106,7 +107,14 @@ def common_points(
     seen = np.unique(np.concatenate([mates, *(part.linear.image for part in parts)])).astype(np.int32)
     found = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
     order = np.argsort(found, kind="stable")
-    return CommonPoints(found[order], order, tuple(parts), mates, source.image_set(mates).priors, source.sub_min(tile, seen))
+    return CommonPoints(found[order], order, tuple(parts), mates, source.image_set(mates).priors, _marginal(sub_min(tile), seen))
+
+
+def _marginal(state: SubMin, images: Index) -> SubMin:
+    """A sub-MIN's marginal on some of its images."""
+    at, p = np.searchsorted(state.images, images), state.theta.shape[1]
+    rows = (at[:, None] * p + np.arange(p)).ravel()
+    return replace(state, images=images, theta=state.theta[at], covariance=state.covariance[np.ix_(rows, rows)])
 
 
 def _shares(prior: ImagePrior) -> bool:
@@ -141,7 +149,7 @@ def block_test(common: CommonPoints, images: ImageSet, ids: Ids, rays: Rays, adj
     origin[prior.point] = prior.position
     every = np.ones(k, dtype=np.bool_)
     linear = linearise(released, rays, adjusted.theta, adjusted.ground, origin)
-    first = innovation_test(linear, weight, prior, every, estimate(linear, weight, prior, every, origin))
+    first = innovation_of(linear, weight, prior, every)
     if not first.dof:
         return None
     bad = int(adjusted.released.sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +13,16 @@ import numpy as np
 import pytest
 from networks import area_of, fuse, rewrite, same_network
 
+import submin
+from orchestration.batch import block_rays
 from orchestration.cli import main
 from orchestration.executors import SerialExecutor, executor_for
 from orchestration.run import RunResult, run
 from orchestration.withdraw import withdraw
+from submin.adjustment.control import ControlledPrior
+from submin.network.network_image import image_set
+from submin.query.block_control import control_of_block
+from submin.query.block_innovation import common_points
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
@@ -57,8 +64,6 @@ def others(region: SimulatedRegion, catalogue: Path, blocks: list[Block], tmp_pa
 
 @pytest.fixture
 def network(others: Path, tmp_path: Path) -> Path:
-    import shutil
-
     return Path(shutil.copytree(others, tmp_path / "network"))
 
 
@@ -66,6 +71,46 @@ def come(catalogue: Path, network: Path, folder: Path, block: Block, **options: 
     if not folder.exists():
         rewrite(catalogue, folder, [block])
     return run(Catalogue.open(folder), str(network), HERE, **options)
+
+
+def test_what_the_tile_knows_of_the_block_is_that_of_the_joined_network(others: Path, blocks: list[Block]) -> None:
+    """From stored covariances, against the tile factored again with the block's images joined to it."""
+    block = block_rays(blocks[LAST])
+    network = submin.open(others)
+    ids = np.unique(block.point_ids)
+    cells = network.snapshot.candidate_cells(ids)
+    images = image_set(block.images, network.cover.ellipsoid, 6)
+    passes = network.snapshot.image_columns(["pass_id"])["pass_id"]
+    mates = np.isin(passes, [image.pass_id for image in block.images])
+    assert mates.any()
+
+    def mates_in(tile: int) -> np.ndarray:
+        rows = network.snapshot.tile_images(tile)
+        return rows[mates[rows]]
+
+    common = common_points(network, ids, cells, images, mates_in, lambda tile: network.sub_min(tile, None))
+    assert common is not None
+    assert len(common.mates) > 0
+    held = np.where(np.isin(ids, common.ids), cells, -1)
+    joined = control_of_block(network, ids, held, "tile", network.snapshot.image_count())
+    assert joined is not None
+    found, expected = common.prior(images, ids), joined.prior(images, ids)
+    assert np.array_equal(found.point, expected.point)
+    assert len(found.point) > 10
+    sigma = np.sqrt((expected.images**2).sum(axis=1)).reshape(expected.theta.shape)
+    assert np.abs(expected.theta / sigma).max() > 0.1  # the pass is known to some extent
+    assert np.abs((found.theta - expected.theta) / sigma).max() < 1e-6
+
+    def joint(prior: ControlledPrior) -> np.ndarray:
+        root = np.concatenate([prior.loading.reshape(3 * len(prior.point), -1), prior.images])
+        return np.asarray(root @ root.T)
+
+    a, b = joint(found), joint(expected)
+    scale = np.sqrt(np.diag(b))
+    assert np.abs((a - b) / scale / scale[:, None]).max() < 1e-6
+    k = 3 * len(found.point)
+    assert np.abs(b[:k, k:] / scale[:k, None] / scale[k:]).max() > 0.1  # and correlated with the points
+    assert np.abs(found.position - expected.position).max() < 1e-6
 
 
 @pytest.mark.parametrize("harm", [warped, displaced, stretched], ids=lambda harm: harm.__name__)

@@ -8,7 +8,7 @@ from scipy.stats import chi2, kstest
 
 from orchestration.batch import block_rays
 from submin.adjustment.adjustment import adjust
-from submin.adjustment.control import correlated, estimate, innovation_test
+from submin.adjustment.control import correlated, estimate, innovation_of, innovation_test
 from submin.adjustment.elimination import linearise
 from submin.adjustment.intersection import intersect
 from submin.adjustment.quality import quality
@@ -109,6 +109,7 @@ def test_by_rays_or_by_covariances_it_is_the_same_number() -> None:
     origin[common] = position
     linear, weight, active = linearise(images, rays, result.theta, result.ground, origin), result.accepted * 1.0, np.ones(6, dtype=np.bool_)
     by_rays = innovation_test(linear, weight, prior, active, estimate(linear, weight, prior, active, origin))
+    assert innovation_of(linear, weight, prior, active).d2 == pytest.approx(by_rays.d2, rel=1e-9)
     by_points = innovation(result.ground[common], free.joint_covariance(common), position, known)
     assert by_rays.dof == by_points.dof == 18
     assert by_rays.d2 == pytest.approx(by_points.d2, rel=1e-4)  # the free block's solution is that of its last step
