@@ -308,12 +308,8 @@ def _new(arrivals: Iterable[Arrival], work: Working, tally: DenseTally, reporter
                 raise InputError(_with_other_content(arrival))
             yield arrival, work.admitted(arrival)
         except (InputError, NumericalError) as error:
-            yield (
-                arrival,
-                Rejected(
-                    name, str(error), arrival.kind, arrival.point_ids if isinstance(arrival, Member) and arrival.kind == "control" else ()
-                ),
-            )
+            points = arrival.point_ids if isinstance(arrival, Member) and arrival.kind == "control" else ()
+            yield arrival, Rejected(name, str(error), arrival.kind, points)
 
 
 def _with_other_content(arrival: Arrival) -> str:

@@ -22,8 +22,8 @@ from orchestration.plan import Plan, TilePlan, plan
 from orchestration.run import run
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
+from submin.storage.catalogue_schema import CONTROL_PREFIX
 from submin.storage.catalogue_writer import CatalogueWriter
-from submin.storage.control_blocks import control_point_of
 from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
 
@@ -42,7 +42,7 @@ def found(network: str) -> dict[str, TilePlan]:
         images = snapshot.tile_images(tile)
         cells = [cell for cell in cover.cells_held(tile) if cell in snapshot.cell_numbers()]
         rays = sum(snapshot.cell_attributes(cell)["rays"] for cell in cells)
-        of_images = {block for block in blocks[images].tolist() if control_point_of(block) is None}
+        of_images = {block for block in blocks[images].tolist() if not block.startswith(CONTROL_PREFIX)}
         tiles[cover.tile_name(tile)] = TilePlan("", len(of_images), len(images), 6 * len(images), rays)
     return tiles
 
