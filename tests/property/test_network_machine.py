@@ -27,6 +27,7 @@ from orchestration.control import add_control
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.run import run
+from orchestration.verify import verify
 from orchestration.withdraw import withdraw
 from submin.adjustment.priors import APriori
 from submin.errors import InputError
@@ -264,7 +265,8 @@ class NetworkMachine(RuleBasedStateMachine):
             assert len(snapshot.tile_images(tile)) <= 10 or not snapshot.cover.can_split(tile)
 
     def is_the_network_of_its_blocks(self) -> None:
-        """One network made at once of what is in, with the tiles that have come about, is the same."""
+        """One network made at once of what is in, with the tiles that have come about, is the same; and it is sound."""
+        assert verify(str(self.network), HERE).problems == ()
         NetworkMachine.count += 1
         fresh = self.folder / f"fresh-{NetworkMachine.count}"
         create_network(str(fresh), Snapshot.open(str(self.network)).metadata)
