@@ -15,6 +15,7 @@ from submin.errors import StoreError, SubminError
 from submin.network.variance_factor import VarianceFactor, pooled
 from submin.storage.network_store import Snapshot
 from submin.storage.problems import DAMAGE, Problem, first_line
+from submin.storage.verify_dense import verify_dense
 from submin.storage.verify_tables import stored_tiles, verify_network
 from submin.storage.verify_tile import TileHealth, verify_tile
 
@@ -113,5 +114,15 @@ def _factored(snapshot: Snapshot, executor: Executor, reporter: Reporter) -> tup
     return problems, found
 
 
-FORMS: dict[str, Callable[[Snapshot, Executor, Reporter], tuple[list[Problem], list[TileHealth]]]] = {"factored": _factored}
+def _dense(snapshot: Snapshot, executor: Executor, reporter: Reporter) -> tuple[list[Problem], list[TileHealth]]:
+    """A network of one vector of points."""
+    handles = executor.submit_all(verify_dense, [(snapshot,)], "verify-dense", reporter.stage("verifying the network", 1))
+    [(problems, tiles)] = executor.results(handles)
+    return problems, tiles
+
+
+FORMS: dict[str, Callable[[Snapshot, Executor, Reporter], tuple[list[Problem], list[TileHealth]]]] = {
+    "factored": _factored,
+    "dense": _dense,
+}
 """How a network of each form is checked."""

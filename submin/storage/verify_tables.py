@@ -44,7 +44,7 @@ def verify_network(snapshot: Snapshot, cells: Sequence[CellContents], complete: 
     """
     problems: list[Problem] = []
     checks: tuple[tuple[str, Callable[[], list[Problem]]], ...] = (
-        ("the history", lambda: _history(snapshot)),
+        ("the history", lambda: verify_history(snapshot)),
         ("the image table", lambda: _image_table(snapshot)),
         ("the ledger", lambda: _ledger(snapshot, cells, complete)),
         ("the flags of bad cameras", lambda: _flags(snapshot)),
@@ -58,7 +58,7 @@ def verify_network(snapshot: Snapshot, cells: Sequence[CellContents], complete: 
     return problems
 
 
-def _history(snapshot: Snapshot) -> list[Problem]:
+def verify_history(snapshot: Snapshot) -> list[Problem]:
     """The number of a version is written in its root and in its commit."""
     count = [version.number for version in versions(snapshot.place)].count(snapshot.number)
     return [] if count == 1 else [Problem("", "metadata", f"the root says version {snapshot.number}; the history has {count} of them")]
