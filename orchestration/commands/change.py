@@ -48,9 +48,9 @@ def create(
     from orchestration.create import create as make
     from orchestration.create import fit_catalogue, fit_points, read_area
     from submin.errors import InputError
+    from submin.query.asked import box_area
     from submin.storage.catalogue import Catalogue
     from submin.storage.catalogue_schema import CatalogueMetadata
-    from submin.storage.network import box_area
 
     if sum(value is not None for value in (bbox, aoi, fit)) != 1:
         raise InputError("give the area by exactly one of --bbox, --aoi and --fit")

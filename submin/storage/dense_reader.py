@@ -14,6 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from submin import accuracy
 from submin.errors import InputError, QueryError
 from submin.geodesy import geocentric_to_geodetic, local_axes, rotate_covariance
+from submin.query.asked import few
 from submin.query.control_set import ControlSet
 from submin.query.spread import spread_rows
 from submin.storage.dense_store import DensePoints, Member, Rows, read_covariance, read_members, read_points
@@ -98,10 +99,7 @@ class DenseReader:
         ids = np.unique(np.asarray(points, dtype=np.str_))
         missing = np.setdiff1d(ids, self.points.ids)
         if len(missing):
-            raise QueryError(
-                f"{len(missing)} of {len(ids)} points are not in the network or not yet determined: "
-                f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
-            )
+            raise QueryError(f"{len(missing)} of {len(ids)} points are not in the network or not yet determined: {few(missing)}")
         return np.flatnonzero(np.isin(self.points.ids, ids))
 
     def answer(self, rows: Rows, policy: str, max_points: int | None) -> ControlSet:
@@ -110,7 +108,7 @@ class DenseReader:
         Raises
         ------
         QueryError
-            When another policy is asked for than that of one tile.
+            When another policy is asked for than that of one tile, or ``max_points`` is below 1.
         """
         if policy not in DENSE_POLICIES:
             raise QueryError(

@@ -20,33 +20,30 @@ from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
 from submin.network.cell import Cell, widened_sums
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.sub_min import GroundPart, SubMin
+from submin.network.sub_min import SubMin
 from submin.network.thinning import reported_points
+from submin.query.asked import Asked, few
 from submin.query.control_set import ControlSet
-from submin.query.cross_covariance import cross_covariance
+from submin.query.cross_covariance import PointsOfTile, cross_covariance, points_of_one_tile
 from submin.query.planner import (
     Answer,
     Selection,
     all_points,
     answer,
-    determined_parts,
     points_in_area,
     points_named,
     points_of_tile,
     well_spread,
 )
 from submin.query.point_metadata import PointMetadata, metadata_of_points
-from submin.query.with_block import BlockRays, TileWithBlock, with_block
-from submin.sensors import width_of
 from submin.storage.arrays import group_of, read_record
-from submin.storage.block_images import network_images
-from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
 from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_sums_of
+from submin.storage.tile_view import TileView
 from submin.storage.validity import Validity, today
 from submin.tiling.cover import Cover
 
@@ -97,15 +94,15 @@ class Network:
         """What only a dense network has; None for a factored one."""
         return self._dense
 
-    def at(self, version: str) -> Network:
-        """The same network at another version.
+    def at(self, version: str, parameters: int = 0) -> Network:
+        """The same network at another version; ``parameters`` as for a new one.
 
         Raises
         ------
         QueryError
             When there is no such version.
         """
-        return Network(self._snapshot.place, version)
+        return Network(self._snapshot.place, version, parameters)
 
     def query(
         self,
@@ -138,10 +135,11 @@ class Network:
         QueryError
             When nothing or too much is asked, a policy, tile or point is unknown, a box is not one, or ``max_points`` is below 1.
         """
+        asked = Asked.of(bbox, area, points, tile)
         if self._dense is not None:
-            return self._query_dense(self._dense, bbox, area, points, tile, policy, max_points)
-        selections, number = self._selected(bbox, area, points, tile, max_points, today() if on is None else on)
-        return self.control_set(answer(self, selections, policy, number))
+            return self._query_dense(self._dense, asked, policy, max_points)
+        selections, tile_number = self._selected(asked, max_points, today() if on is None else on)
+        return self.control_set(answer(self, selections, policy, tile_number))
 
     def export(
         self,
@@ -179,51 +177,35 @@ class Network:
         """
         check_suffix(path)
         check_asked(family, rank, floor)
+        asked = Asked() if bbox is None and area is None and tile is None else Asked.of(bbox, area, tile=tile)
         if self._dense is not None:
-            everything = self.cover.tile_name(0) if bbox is None and area is None and tile is None else tile
-            control = self._query_dense(self._dense, bbox, area, None, everything, policy, max_points)
+            control = self._query_dense(self._dense, asked, policy, max_points)
             check_size(len(control))
-            return write_compact(path, control, control.compact(family, rank, floor))
-        if bbox is None and area is None and tile is None:
-            selections, number = self._reported(all_points(self), today()), None
-            if max_points is not None:
-                selections = well_spread(self, selections, max_points)
         else:
-            selections, number = self._selected(bbox, area, None, tile, max_points, today())
-        check_size(sum(len(s.rows) for s in selections))  # before a joint covariance of that size is made
-        control = self.control_set(answer(self, selections, policy, number))
+            selections, tile_number = self._selected(asked, max_points, today())
+            check_size(sum(len(s.rows) for s in selections))  # before a joint covariance of that size is made
+            control = self.control_set(answer(self, selections, policy, tile_number))
         return write_compact(path, control, control.compact(family, rank, floor))
 
-    def _selected(
-        self, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None, points: Sequence[str] | NDArray[np.str_] | None,
-        tile: str | None, max_points: int | None, on: date,
-    ) -> tuple[list[Selection], int | None]:  # fmt: skip
+    def _selected(self, asked: Asked, max_points: int | None, on: date) -> tuple[list[Selection], int | None]:
         """Points that are asked for, and the number of the tile that is named."""
-        _check_asked(bbox, area, points, tile)
-        number = None if tile is None else self.cover.tile_number(tile)
-        if bbox is not None:
-            area = box_area(bbox)
-        if area is not None:
-            selections = points_in_area(self, area)
-            if not selections and _inside_when_swapped(area, self.cover):
-                raise QueryError(
-                    "the area queried is outside the network, and inside it with its axes swapped; expected longitude first, then latitude"
-                )
-        elif points is not None:
-            ids = np.unique(np.asarray(points, dtype=np.str_))
-            selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids))
+        number = None if asked.tile is None else self.cover.tile_number(asked.tile)
+        if asked.area is not None:
+            selections = points_in_area(self, asked.area)
+            if not selections:
+                asked.refuse_swapped(self.cover)
+        elif asked.points is not None:
+            selections, missing = points_named(self, asked.points, self._snapshot.candidate_cells(asked.points))
             if len(missing):
                 raise QueryError(
-                    f"{len(missing)} of {len(ids)} points are not in the network or not yet determined by two rays: "
-                    f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+                    f"{len(missing)} of {len(asked.points)} points are not in the network or not yet determined by two rays: {few(missing)}"
                 )
         else:
-            assert number is not None
-            selections = points_of_tile(self, number)
+            selections = all_points(self) if number is None else points_of_tile(self, number)
         if number is not None:
             held = set(self.cover.cells_held(number))
             selections = [s for s in selections if s.cell.number in held]
-        if points is None:
+        if asked.points is None:
             selections = self._reported(selections, on)
         if max_points is not None:
             selections = well_spread(self, selections, max_points)
@@ -249,21 +231,18 @@ class Network:
             When nothing or too much is asked, a tile or point is unknown, or a box is not one.
         """
         refuse_dense(self._snapshot, "metadata of points")
-        asked = [n for n, value in (("bbox", bbox), ("area", area), ("points", points), ("tile", tile)) if value is not None]
-        if len(asked) != 1:
-            raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, tile")
-        area = area if bbox is None else box_area(bbox)
-        if area is not None:
-            selections = points_in_area(self, area, every=True)
-        elif points is not None:
-            selections = self.named(points)
+        asked = Asked.of(bbox, area, points, tile, one=True)
+        if asked.area is not None:
+            selections = points_in_area(self, asked.area, every=True)
+        elif asked.points is not None:
+            selections = self.named(asked.points)
         else:
-            assert tile is not None
-            selections = points_of_tile(self, self.cover.tile_number(tile), every=True)
+            assert asked.tile is not None
+            selections = points_of_tile(self, self.cover.tile_number(asked.tile), every=True)
         snapshot = self._snapshot
         found = metadata_of_points(self, selections, image_facts(snapshot), check_points(snapshot), snapshot.metadata.thinning)
-        if area is not None:
-            found = found.take(np.asarray(shapely.intersects_xy(area, found.geodetic[:, 0], found.geodetic[:, 1]), dtype=bool))
+        if asked.area is not None:
+            found = found.take(np.asarray(shapely.intersects_xy(asked.area, found.geodetic[:, 0], found.geodetic[:, 1]), dtype=bool))
         valid_from, valid_to, reason = self.validity.rows_of(found.ids)
         return replace(
             found, valid_from=valid_from, valid_to=valid_to, reason=reason, epoch=snapshot.metadata.epoch, version=self.version
@@ -281,8 +260,7 @@ class Network:
         ids = np.unique(np.asarray(points, dtype=np.str_))
         selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids), every=True)
         if len(missing):
-            shown = f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
-            raise QueryError(f"{len(missing)} of {len(ids)} points are not in the network: {shown}; expected ids of its points")
+            raise QueryError(f"{len(missing)} of {len(ids)} points are not in the network: {few(missing)}; expected ids of its points")
         return selections
 
     @cached_property
@@ -304,24 +282,17 @@ class Network:
             kept.append(Selection(s.cell, s.rows[reported[s.rows]]))
         return [s for s in kept if len(s.rows)]
 
-    def _query_dense(
-        self, dense: DenseReader, bbox: tuple[float, float, float, float] | None, area: BaseGeometry | None,
-        points: Sequence[str] | NDArray[np.str_] | None, tile: str | None, policy: str, most: int | None,
-    ) -> ControlSet:  # fmt: skip
+    def _query_dense(self, dense: DenseReader, asked: Asked, policy: str, max_points: int | None) -> ControlSet:
         """Answer of a dense network; its one tile holds every point."""
-        _check_asked(bbox, area, points, tile)
-        if tile is not None:
-            self.cover.tile_number(tile)  # an unknown one is refused
-        area = area if bbox is None else box_area(bbox)
-        if area is not None:
-            rows = dense.in_area(area)
-            if not len(rows) and _inside_when_swapped(area, self.cover):
-                raise QueryError(
-                    "the area queried is outside the network, and inside it with its axes swapped; expected longitude first, then latitude"
-                )
+        if asked.tile is not None:
+            self.cover.tile_number(asked.tile)  # an unknown one is refused
+        if asked.area is not None:
+            rows = dense.in_area(asked.area)
+            if not len(rows):
+                asked.refuse_swapped(self.cover)
         else:
-            rows = np.arange(len(dense.points.ids)) if points is None else dense.named(points)
-        return dense.answer(rows, policy, most)
+            rows = np.arange(len(dense.points.ids)) if asked.points is None else dense.named(asked.points)
+        return dense.answer(rows, policy, max_points)
 
     def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
         """Those of some points that the network can answer for, by their cell."""
@@ -352,28 +323,14 @@ class Network:
             When a tile does not hold a point, or a point is not determined.
         """
         refuse_dense(self._snapshot, "a covariance between tiles")
-        tiles = self.cover.tile_number(one), self.cover.tile_number(other)
-        found = [self._parts_of_tile(tile, np.asarray(ids, dtype=np.str_)) for tile, ids in zip(tiles, (ids_one, ids_other), strict=True)]
-        (names, parts, places), (names_other, parts_other, places_other) = found
-        whole = cross_covariance(self, tiles, (names, names_other), (parts, parts_other))
-        axes = np.arange(3)
-        return np.asarray(whole[np.ix_((3 * places[:, None] + axes).ravel(), (3 * places_other[:, None] + axes).ravel())])
+        first, second = (
+            self._points_of_tile(self.cover.tile_number(tile), np.asarray(ids, dtype=np.str_))
+            for tile, ids in ((one, ids_one), (other, ids_other))
+        )
+        return cross_covariance(self, first, second)
 
-    def _parts_of_tile(self, tile: int, ids: NDArray[np.str_]) -> tuple[NDArray[np.str_], list[GroundPart], NDArray[np.int64]]:
-        """Ground parts of named points that a tile holds, the names in their order, and the place of each id asked for."""
-        unique = np.unique(ids)
-        cells = self._snapshot.candidate_cells(unique)
-        selections, missing = points_named(self, unique, np.where(np.isin(cells, self.cover.cells_held(tile)), cells, -1))
-        kept, parts = determined_parts(self, selections)
-        names = np.concatenate([np.empty(0, dtype="U1"), *(s.cell.point_ids[s.rows] for s in kept)])
-        missing = np.unique(np.concatenate([missing, np.setdiff1d(unique, names)]))
-        if len(missing):
-            raise QueryError(
-                f"tile {self.cover.tile_name(tile)} does not hold {len(missing)} of {len(unique)} points, or they are not yet determined: "
-                f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
-            )
-        order = np.argsort(names)
-        return names, parts, order[np.searchsorted(names[order], ids)]
+    def _points_of_tile(self, tile: int, ids: NDArray[np.str_]) -> PointsOfTile:
+        return points_of_one_tile(self, tile, ids, self._snapshot.candidate_cells(np.unique(ids)))
 
     def tile(self, name: str) -> TileView:
         """One sub-MIN alone."""
@@ -440,131 +397,6 @@ class Network:
             scope="network" if found.network_wide else "tiles",
             validity=self.validity.intervals(found.ids),
         )
-
-
-class TileView:
-    """One sub-MIN of a network, by itself."""
-
-    def __init__(self, network: Network, number: int) -> None:
-        self._network, self._number = network, number
-
-    @property
-    def name(self) -> str:
-        """Name of the tile."""
-        return self._network.cover.tile_name(self._number)
-
-    def query(self, ids: Sequence[str] | None = None) -> ControlSet:
-        """Control points of this sub-MIN alone: those named, or all that it holds."""
-        return self._network.query(points=ids, tile=self.name, policy="tile")
-
-    def covariance(self, ids: Sequence[str]) -> Array:
-        """Joint covariance (3n, 3n) of points, geocentric square metres, in the order of their ids ascending, from this sub-MIN alone."""
-        return self.query(ids).covariance
-
-    def with_block(self, block: Block) -> TilePreview:
-        """What a block that is not in the network would bring to this sub-MIN alone: fused in memory, nothing is written.
-
-        Its rays are taken as they are, where a run would judge them; points that the network holds in other tiles only take no part.
-
-        Raises
-        ------
-        QueryError
-            When an image of the block is in the network already, or none of its rays falls into the tile.
-        """
-        images = network_images(block)
-        opened = self._network
-        width = width_of(image.sensor for image in images)
-        if width > opened.snapshot.metadata.parameters:
-            opened = Network(opened.snapshot.place, opened.version, width)
-        names = opened.snapshot.image_columns(["image_id"])["image_id"] if opened.snapshot.image_count() else np.empty(0, dtype="U1")
-        twice = [image.image_id for image in images if image.image_id in names]
-        if twice:
-            raise QueryError(f"image {twice[0]} of block {block.block_id} is in the network already; expected a block that is not")
-        ids = np.unique(block.point_ids)
-        rays = BlockRays(
-            image_set(images, opened.snapshot.metadata.ellipsoid, opened.snapshot.metadata.parameters), block.point_ids, block.image,
-            np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line]),
-        )  # fmt: skip
-        elsewhere = ids[opened.snapshot.candidate_cells(ids) >= 0]
-        return TilePreview(opened, with_block(opened, self._number, rays, elsewhere, opened.snapshot.image_count()))
-
-
-class TilePreview:
-    """One sub-MIN with a block in it that is not in the network."""
-
-    def __init__(self, network: Network, source: TileWithBlock) -> None:
-        self._network, self._source = network, source
-
-    @property
-    def chi_square(self) -> float:
-        """By how much the block adds to the weighted squares of the tile: chi-square when block and tile agree."""
-        return self._source.fused.chi_square
-
-    @property
-    def redundancy(self) -> int:
-        """Degrees of freedom of ``chi_square``."""
-        return self._source.fused.redundancy
-
-    @property
-    def rank(self) -> int:
-        """Directions, at most, in which the block changes what is known of the images."""
-        return self._source.fused.rank
-
-    def query(self, ids: Sequence[str] | None = None) -> ControlSet:
-        """Control points of this sub-MIN with the block: those named, or all that the tile and the block determine.
-
-        Raises
-        ------
-        QueryError
-            When a point named is not in the tile, or not determined.
-        """
-        selections = points_of_tile(self._source, self._source.tile)
-        if ids is not None:
-            wanted = np.unique(np.asarray(ids, dtype=np.str_))
-            selections = [Selection(s.cell, s.rows[np.isin(s.cell.point_ids[s.rows], wanted)]) for s in selections]
-            selections = [s for s in selections if len(s.rows)]
-            found = np.concatenate([s.cell.point_ids[s.rows] for s in selections] or [wanted[:0]])
-            missing = np.setdiff1d(wanted, found)
-            if len(missing):
-                raise QueryError(f"{len(missing)} of {len(wanted)} points are not determined in the tile, {missing[0]} among them")
-        return self._network.control_set(answer(self._source, selections, "tile", self._source.tile))
-
-
-def _check_asked(bbox: object, area: object, points: object, tile: str | None) -> None:
-    """Refuse a query by nothing, or by more than one of box, area and points."""
-    asked = [name for name, value in (("bbox", bbox), ("area", area), ("points", points)) if value is not None]
-    if len(asked) > 1 or (not asked and tile is None):
-        raise QueryError(f"asked by {' and '.join(asked) or 'nothing'}; expected one of bbox, area, points, or a tile")
-
-
-def box_area(bbox: tuple[float, float, float, float]) -> BaseGeometry:
-    """Area of a box: west, south, east, north in degrees; west above east means across the antimeridian.
-
-    Raises
-    ------
-    QueryError
-        When the numbers are no box on a globe.
-    """
-    west, south, east, north = bbox
-    globe = -90.0 <= south < north <= 90.0 and -180.0 <= west <= 180.0 and -180.0 <= east <= 180.0
-    if not (np.isfinite(bbox).all() and globe and west != east):
-        swapped = -90.0 <= west < east <= 90.0 and abs(south) > 90.0
-        raise QueryError(
-            f"bbox is {west:g} {south:g} {east:g} {north:g}; expected west south east north in degrees"
-            + ("; longitude and latitude look swapped" if swapped else "")
-        )
-    if west > east:
-        return shapely.union_all([shapely.box(west, south, 180.0, north), shapely.box(-180.0, south, east, north)])
-    return shapely.box(west, south, east, north)
-
-
-def _inside_when_swapped(area: BaseGeometry, cover: Cover) -> bool:
-    """True when the middle of an area is outside the cover, and inside it with longitude and latitude exchanged."""
-    middle = shapely.box(*area.bounds).centroid
-    longitude, latitude = np.array([middle.x]), np.array([middle.y])
-    if area.is_empty or abs(middle.x) > 90.0:
-        return False
-    return bool(cover.outside(longitude, latitude)[0] and not cover.outside(latitude, longitude)[0])
 
 
 def open_network(path: str | Path, version: str | None = None) -> Network:
