@@ -18,7 +18,7 @@ from submin.network.cell import Cell, factors
 from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate
 from submin.query import bounded_inflation, covariance_intersection, rigorous, split_intersection, tile
 from submin.query.source import Index, NetworkSource
-from submin.query.spread import spread_rows
+from submin.query.spread import check_most, spread_rows
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -151,8 +151,7 @@ def well_spread(source: NetworkSource, selections: Sequence[Selection], most: in
     QueryError
         When ``most`` is below 1.
     """
-    if most < 1:
-        raise QueryError(f"max_points is {most}; expected 1 or more")
+    check_most(most)
     if sum(len(s.rows) for s in selections) <= most:
         return list(selections)
     kept, parts = determined_parts(source, selections)

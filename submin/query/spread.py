@@ -7,12 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.point_basis import Array
+from submin.errors import QueryError
 
 Rows = NDArray[np.int64]
 
 HALVINGS = 30
 LEAST_DISTANCE = 1e-6
 """Least distance tried, over the extent of all points: what is left to choose then lies at a few places."""
+
+
+def check_most(most: int) -> None:
+    """Raise `QueryError` for fewer than one point."""
+    if most < 1:
+        raise QueryError(f"max_points is {most}; expected 1 or more")
 
 
 def spread_rows(place: Array, variance: Array, ids: NDArray[np.str_], most: int) -> Rows:
@@ -29,7 +36,13 @@ def spread_rows(place: Array, variance: Array, ids: NDArray[np.str_], most: int)
     variance : (n,) of each point, any unit; compared to six digits, so that round-off does not choose
     ids : (n,) different ids: they decide between equal points
     most : 1 or more
+
+    Raises
+    ------
+    QueryError
+        When ``most`` is below 1.
     """
+    check_most(most)
     n = len(ids)
     if n <= most:
         return np.arange(n)

@@ -144,6 +144,8 @@ def test_a_query_is_the_marginal_of_the_state(
     assert 0 < len(part) < len(whole)
     few = network.query(tile="r000c000", max_points=7)
     assert len(few) == 7
+    with pytest.raises(QueryError, match="max_points is 0; expected 1 or more"):
+        network.query(tile="r000c000", max_points=0)
     for policy in ("rigorous", "ci"):
         with pytest.raises(QueryError, match="one tile and nothing to merge"):
             network.query(tile="r000c000", policy=policy)
