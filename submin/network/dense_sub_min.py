@@ -23,7 +23,7 @@ UNDETERMINED = 1e-10
 
 
 @dataclass(frozen=True)
-class Innovation:
+class BlockInnovation:
     """How well a block agreed with what was there.
 
     Attributes
@@ -128,7 +128,7 @@ class DenseSubMin:
         """Joint covariance (3k, 3k) of the points at these places, square metres."""
         return self.triangle.submatrix(_coordinates(rows))
 
-    def fuse(self, block: PointObservations) -> Innovation:
+    def fuse(self, block: PointObservations) -> BlockInnovation:
         """Fuse a block: any linear observations of points, with their full covariance. New points have no prior.
 
         One symmetric rank-m update of one triangle, in place; besides it arrays of m rows are made, none of the size of the state squared.
@@ -177,7 +177,7 @@ class DenseSubMin:
         self._blocks |= dict.fromkeys(block.block_ids)
         self.chi_square += d2
         self.redundancy += len(innovation)
-        return Innovation(d2, len(innovation))
+        return BlockInnovation(d2, len(innovation))
 
     def _origins_for(self, block: PointObservations, ids: Ids, rows: Rows) -> Array:
         known = np.full((len(ids), 3), np.nan)

@@ -66,7 +66,7 @@ class Fused:
 
 
 @dataclass(frozen=True)
-class Innovation:
+class InnovationRows:
     """What a block says that the state before it does not: ``innovation = design (theta - theta_0) + noise``, Cov noise = I.
 
     Attributes
@@ -139,7 +139,7 @@ def update(sub_min: SubMin, rays: NewRays, images: Index, image_set: ImageSet) -
     if state is None:
         return None
     p = image_set.parameters
-    innovation = innovation_of(rays, state.theta.ravel(), images, p)
+    innovation = innovation_rows(rays, state.theta.ravel(), images, p)
     k = len(innovation.innovation)
     if not k:  # single rays, or points that no image sees
         grown = innovation.remainder
@@ -160,16 +160,16 @@ def update(sub_min: SubMin, rays: NewRays, images: Index, image_set: ImageSet) -
     return Fused(fused, k, grown, innovation.redundancy, True)
 
 
-def innovation_of(rays: NewRays, theta: Array, images: Index, parameters: int) -> Innovation:
+def innovation_rows(rays: NewRays, theta: Array, images: Index, parameters: int) -> InnovationRows:
     """What new rays say beyond a state ``theta`` (m p,) of images (rows of the network, ascending), in as few rows as that takes."""
     touched = (np.searchsorted(images, rays.images)[:, None] * parameters + np.arange(parameters)).ravel()
     design, observed, redundancy = rows_of(rays)
     innovation, t = observed - design @ theta[touched], len(touched)
     if len(innovation) <= t:
-        return Innovation(touched, design, innovation, 0.0, redundancy)
+        return InnovationRows(touched, design, innovation, 0.0, redundancy)
     # Q'[H, e] with Q'Q = I says the same in t rows; the Gram matrix would say it with two digits less
     triangle = la.qr(np.column_stack([design, innovation]), mode="r", overwrite_a=True, check_finite=False)[0]
-    return Innovation(touched, triangle[:t, :t], triangle[:t, t].copy(), float(triangle[t, t] ** 2), redundancy)
+    return InnovationRows(touched, triangle[:t, :t], triangle[:t, t].copy(), float(triangle[t, t] ** 2), redundancy)
 
 
 def extended(sub_min: SubMin, images: Index, image_set: ImageSet) -> SubMin | None:

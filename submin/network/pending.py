@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from submin.errors import InputError
-from submin.network.dense_sub_min import DenseSubMin, Innovation
+from submin.network.dense_sub_min import BlockInnovation, DenseSubMin
 from submin.network.observations import Cluster, PointObservations, Stack
 
 Array = NDArray[np.float64]
@@ -25,11 +25,11 @@ FREE = 1e-6
 
 
 @dataclass(frozen=True)
-class Fused:
+class FusedBlocks:
     """Blocks that were fused together (mostly one), and how they agreed with what was there."""
 
     block_ids: tuple[str, ...]
-    innovation: Innovation
+    innovation: BlockInnovation
 
 
 class DenseNetwork:
@@ -57,7 +57,7 @@ class DenseNetwork:
         """Blocks that wait, by name."""
         return tuple(sorted(set(self.blocks) - set(self.state.blocks)))
 
-    def add(self, blocks: Iterable[PointObservations]) -> list[Fused]:
+    def add(self, blocks: Iterable[PointObservations]) -> list[FusedBlocks]:
         """Add blocks, and fuse every one that can be, earlier ones too.
 
         Raises
@@ -75,7 +75,7 @@ class DenseNetwork:
         self.blocks = new
         every, fused = list(new.values()), set(self.state.blocks)
         ready = [block for block, can in zip(every, fusable(every), strict=True) if can and block.block_id not in fused]
-        return [Fused(block.block_ids, self.state.fuse(block)) for block in in_order(ready, self.state.ids.tolist())]
+        return [FusedBlocks(block.block_ids, self.state.fuse(block)) for block in in_order(ready, self.state.ids.tolist())]
 
     def without(self, names: Iterable[str]) -> DenseNetwork:
         """The network of all other blocks, fused anew: as if these had never come.
