@@ -13,6 +13,7 @@ in common and nobody else sees is the same number in both. Single points have le
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 import scipy.linalg as la
@@ -35,9 +36,11 @@ def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: 
     """A posteriori state of the images by bounded inflation; for a point asked for alone the tighter one of that and its own fusion."""
     padded = padded_tiles(source, tiles)
     count = len(tiles)
-    bounds = [[1.0 if s == t else _bound(cross_information(padded, s, t)) for t in range(count)] for s in range(count)]
+    bounds = np.eye(count)
+    for s, t in combinations(range(count), 2):
+        bounds[s, t] = bounds[t, s] = _bound(cross_information(padded, s, t))
     functionals = padded.functionals(parts)
-    scale = inflation(padded.of_tiles, np.array(bounds), functionals)
+    scale = inflation(padded.of_tiles, bounds, functionals)
     whole = padded.weighted(padded.holds @ (1.0 / scale), float((1.0 / scale).sum()))
     if count == 1 or sum(len(part.origin) for part in parts) > 1:
         return whole
@@ -94,10 +97,9 @@ def _of_one_point(padded: PaddedTiles, parts: Sequence[GroundPart]) -> SubMin:
     information = np.stack([la.inv(_symmetric(loading @ of_tile)) for of_tile in seen])
     roots = [la.cholesky(of_tile) for of_tile in information]  # upper R, R'R = (U M_t U')^-1
     correlation = np.eye(count)
-    for s in range(count):
-        for t in range(s + 1, count):
-            cross = roots[s] @ (seen[s].T @ padded.common(s, t) @ seen[t]) @ roots[t].T
-            correlation[s, t] = correlation[t, s] = _bound(cross)
+    for s, t in combinations(range(count), 2):
+        cross = roots[s] @ (seen[s].T @ padded.common(s, t) @ seen[t]) @ roots[t].T
+        correlation[s, t] = correlation[t, s] = _bound(cross)
     scale = inflation(information, correlation, np.eye(3))
     covariance = la.inv(_symmetric(np.tensordot(1.0 / scale, information, axes=1)))
     vector = padded.holds.T.astype(np.float64) @ padded.vector  # K' h_t of each tile
