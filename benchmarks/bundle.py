@@ -10,7 +10,6 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from orchestration.batch import network_images
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.elimination import eliminate, linearise, point_factors
 from submin.adjustment.intersection import intersect
@@ -19,6 +18,7 @@ from submin.geodesy import WGS84, geocentric_to_geodetic, local_axes, rotate_cov
 from submin.network.network_image import image_set
 from submin.network.sub_min import GroundPart, SubMin, factor, joint_covariance, loadings, locate, point_covariances
 from submin.sensors import width_of
+from submin.storage.block_images import network_images
 from submin.storage.catalogue_schema import Block
 
 Array = NDArray[np.float64]
@@ -68,8 +68,8 @@ def solve(blocks: Iterable[Block], judged: bool = True) -> Solution:
     first = np.cumsum([0, *(len(block.images) for block in blocks)])
     ids, point = np.unique(np.concatenate([block.point_ids for block in blocks]), return_inverse=True)
     image = np.concatenate([block.image + at for block, at in zip(blocks, first, strict=False)]).astype(np.int32)
-    observed = np.concatenate([np.column_stack([block.sample, block.line]) for block in blocks])
-    sigma = np.concatenate([np.column_stack([block.sigma_sample, block.sigma_line]) for block in blocks])
+    observed = np.concatenate([block.observed for block in blocks])
+    sigma = np.concatenate([block.sigma for block in blocks])
     rays = sorted_rays(point.astype(np.int32), image, observed, sigma, np.ones(len(image), dtype=np.bool_))
     origin = intersect(images, rays, len(ids))
     accepted, released = rays.accepted, np.zeros(len(images), dtype=np.bool_)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestration.batch import block_rays, disagreement, network_images
+from orchestration.batch import block_rays, disagreement
 from orchestration.run import check_frames
 from orchestration.tasks import adjust_block
 from submin.accuracy import accuracy_against_truth, nees_per_dof
@@ -30,6 +30,7 @@ from submin.query.control_set import ControlSet
 from submin.query.planner import DETERMINED_METRES
 from submin.sensors import width_of
 from submin.storage.adjusted import NO_COVARIANCE, AdjustedCameras, AdjustedWriter
+from submin.storage.block_images import network_images
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, CatalogueMetadata, PointTable, defects
 from submin.storage.ledger import Ledger
@@ -165,8 +166,7 @@ def _judged(block: Block, catalogue: Catalogue, network: str | None, version: st
         raise InputError(f"{named(block.block_id)}: {reason}")
     images = image_set(network_images(block), ellipsoid, parameters)
     ids, point = np.unique(block.point_ids, return_inverse=True)
-    observed, sigma = np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line])
-    rays = sorted_rays(point.astype(np.int32), block.image, observed, sigma, outcome.accepted)
+    rays = sorted_rays(point.astype(np.int32), block.image, block.observed, block.sigma, outcome.accepted)
     return _Judged(block, images, ids, rays, intersect(images, rays, len(ids)))
 
 

@@ -17,12 +17,13 @@ from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.innovation import REJECTED, BlockTest
 from submin.network.registration import LooseRays, together
-from submin.storage.block_images import network_images as network_images
+from submin.storage.block_images import network_images
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import enter_check_points
 from submin.storage.control_blocks import points_of
 from submin.storage.ledger import UNTESTED, Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
+from submin.tiling.cover import Cover
 
 BLOCKS_A_TASK = 8
 LEAST_AGREEING = 0.5
@@ -201,9 +202,7 @@ def _misplaced(blocks: Sequence[Block], arriving: LooseRays, move: Move) -> dict
     outside = move.registration.outside[: len(arriving)]  # the arriving rays are the first of those that were registered
     inside = np.bincount(arriving.block[~outside], minlength=len(blocks))
     bad = {
-        int(k): "the block lies wholly outside the area of the network; longitude and latitude look swapped, in the area or in its cameras"
-        if _inside_when_swapped(arriving.point_ids[arriving.block == k], move)
-        else "the block lies wholly outside the area of the network; create a network whose area holds it"
+        int(k): wholly_outside(_registered_at(arriving.point_ids[arriving.block == k], move), move.cover)
         for k in np.flatnonzero(inside == 0)
     }
     for k, (point, metres) in move.contradictions.items():
@@ -217,34 +216,34 @@ def _misplaced(blocks: Sequence[Block], arriving: LooseRays, move: Move) -> dict
     return bad
 
 
-def _inside_when_swapped(ids: NDArray[np.str_], move: Move) -> bool:
-    """True when most of some points outside the area would be inside it, were their longitudes latitudes."""
+def wholly_outside(at: NDArray[np.float64], cover: Cover) -> str:
+    """Why a block stays out whose points, at these longitudes and latitudes (p, 2), are all outside the area."""
+    possible = np.abs(at[:, 0]) <= 90.0
+    inside_when_swapped = possible & ~cover.outside(at[:, 1], np.where(possible, at[:, 0], 0.0))
+    return "the block lies wholly outside the area of the network; " + (
+        "longitude and latitude look swapped, in the area or in its cameras"
+        if 2 * int(inside_when_swapped.sum()) > len(at)
+        else "create a network whose area holds it"
+    )
+
+
+def _registered_at(ids: NDArray[np.str_], move: Move) -> NDArray[np.float64]:
+    """Longitude and latitude (p, 2) where some of the points that arrive are registered."""
     arrivals = move.registration.arrivals.values()
     origin = np.concatenate([np.empty((0, 3)), *(a.origin[np.isin(a.point_ids, ids)] for a in arrivals)])
-    geodetic = geocentric_to_geodetic(origin, move.cover.ellipsoid)
-    possible = np.abs(geodetic[:, 0]) <= 90.0
-    inside = possible & ~move.cover.outside(geodetic[:, 1], np.where(possible, geodetic[:, 0], 0.0))
-    return 2 * int(inside.sum()) > len(inside)
+    return geocentric_to_geodetic(origin, move.cover.ellipsoid)[:, :2]
 
 
 def block_rays(block: Block) -> BlockRays:
     """A block of a catalogue as stage 1 sees it."""
-    return BlockRays(block.block_id, network_images(block), block.point_ids, block.image, _observed(block), _sigma(block))
-
-
-def _observed(block: Block) -> NDArray[np.float64]:
-    return np.column_stack([block.sample, block.line])
-
-
-def _sigma(block: Block) -> NDArray[np.float64]:
-    return np.column_stack([block.sigma_sample, block.sigma_line])
+    return BlockRays(block.block_id, network_images(block), block.point_ids, block.image, block.observed, block.sigma)
 
 
 def _arriving(blocks: Sequence[Block], accepted: dict[str, NDArray[np.bool_]], first_image: int) -> LooseRays:
     starts = first_image + np.cumsum([0, *(len(b.images) for b in blocks)])
     return together([
         LooseRays(
-            b.point_ids, (b.image + start).astype(np.int32), _observed(b), _sigma(b), accepted[b.block_id],
+            b.point_ids, (b.image + start).astype(np.int32), b.observed, b.sigma, accepted[b.block_id],
             np.full(len(b), k, dtype=np.int32),
         )
         for k, (b, start) in enumerate(zip(blocks, starts, strict=False))

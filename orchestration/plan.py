@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orchestration.batch import Rejected, network_images
+from orchestration.batch import Rejected, wholly_outside
 from orchestration.expectation import BASIS, Expectation, TileLoad, expected
 from orchestration.progress import Reporter, Silent
 from orchestration.run import DEFAULT_BATCH_BLOCKS, check_frames
@@ -24,6 +24,7 @@ from submin.formats.columns import required_path
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic
 from submin.network.network_image import image_set
 from submin.sensors import width_of
+from submin.storage.block_images import network_images
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks
@@ -193,7 +194,7 @@ def _arrivals(catalogue: Catalogue, snapshot: Snapshot, refused: list[Rejected],
             reason = ledger.refusal(each)
             if reason is None:
                 at, count = _points(each, ellipsoid)
-                reason = _elsewhere(at, cover)
+                reason = wholly_outside(at, cover) if cover.outside(*at.T).all() else None
         if reason is not None:
             refused.append(Rejected(each.block_id, reason))
             continue
@@ -212,22 +213,11 @@ def _arrivals(catalogue: Catalogue, snapshot: Snapshot, refused: list[Rejected],
     return Arrivals(np.array(block, dtype=np.int64), footprints, np.concatenate(places), np.concatenate(rays), np.concatenate(of))
 
 
-def _elsewhere(at: Array, cover: Cover) -> str | None:
-    """Why a run would not let in a block with points at these places (p, 2), when none of them is in the area."""
-    if not cover.outside(*at.T).all():
-        return None
-    swapped = len(at) > 0 and (np.abs(at[:, 0]) <= 90.0).all() and 2 * (~cover.outside(at[:, 1], at[:, 0])).sum() > len(at)
-    return "the block lies wholly outside the area of the network; " + (
-        "longitude and latitude look swapped, in the area or in its cameras" if swapped else "create a network whose area holds it"
-    )
-
-
 def _points(block: Block, ellipsoid: Ellipsoid) -> tuple[Array, Rows]:
     """Longitude and latitude (p, 2) of the points of a block that its cameras reach, and the number (p,) of their rays."""
     images = image_set(network_images(block), ellipsoid, width_of(image.sensor for image in block.images))
     ids, point = np.unique(block.point_ids, return_inverse=True)
-    observed, sigma = np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line])
-    rays = sorted_rays(point.astype(np.int32), block.image, observed, sigma, np.ones(len(point), dtype=np.bool_))
+    rays = sorted_rays(point.astype(np.int32), block.image, block.observed, block.sigma, np.ones(len(point), dtype=np.bool_))
     ground = intersect(images, rays, len(ids))
     reached = np.isfinite(ground).all(axis=1)
     return geocentric_to_geodetic(ground[reached], ellipsoid)[:, :2], np.bincount(point, minlength=len(ids))[reached]

@@ -277,6 +277,16 @@ class Block:
     def __len__(self) -> int:
         return len(self.image)
 
+    @property
+    def observed(self) -> Array:
+        """Sample and line (r, 2) of each ray, pixels."""
+        return np.column_stack([self.sample, self.line])
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (r, 2) of these, pixels."""
+        return np.column_stack([self.sigma_sample, self.sigma_line])
+
     def content_hash(self) -> str:
         """Hexadecimal BLAKE2b of what an adjustment of the block depends on.
 

@@ -64,7 +64,7 @@ class TileView:
         ids = np.unique(block.point_ids)
         rays = BlockRays(
             image_set(images, opened.snapshot.metadata.ellipsoid, opened.snapshot.metadata.parameters), block.point_ids, block.image,
-            np.column_stack([block.sample, block.line]), np.column_stack([block.sigma_sample, block.sigma_line]),
+            block.observed, block.sigma,
         )  # fmt: skip
         elsewhere = ids[opened.snapshot.candidate_cells(ids) >= 0]
         return TilePreview(opened, with_block(opened, self._number, rays, elsewhere, opened.snapshot.image_count()))

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orchestration.batch import network_images
 from submin.adjustment.adjustment import Adjustment, adjust
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
@@ -27,6 +26,7 @@ from submin.adjustment.rays import Rays, sorted_rays
 from submin.geodesy import WGS84
 from submin.network.network_image import image_set
 from submin.sensors import width_of
+from submin.storage.block_images import network_images
 from submin.storage.catalogue import Catalogue
 from submin.storage.rpc_import import import_rpc
 
@@ -99,7 +99,7 @@ def triplet(request: pytest.FixtureRequest, data: Path, tmp_path_factory: pytest
     import_rpc(data / NAME / "images.csv", data / NAME / "rpc", data / NAME / "tracks.csv.gz", folder)
     block = next(Catalogue.open(folder).blocks())
     ids, point = np.unique(block.point_ids, return_inverse=True)
-    observed = np.column_stack([block.sample, block.line])
+    observed = block.observed
     rays = sorted_rays(
         point.astype(np.int32), block.image, observed, np.full_like(observed, request.param), np.ones(len(observed), dtype=np.bool_)
     )  # fmt: skip
