@@ -20,7 +20,7 @@ from submin.geodesy import Ellipsoid, geodetic_to_geocentric, local_axes
 from submin.network.network_image import image_set
 from submin.network.observations import Cluster
 from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate
-from submin.query.planner import DETERMINED_METRES
+from submin.query.planner import determined_by
 from submin.sensors import sensor_named, width_of
 from submin.storage.catalogue_schema import Block, PointTable
 from submin.storage.control_blocks import control_block_id, control_set_id
@@ -83,26 +83,17 @@ def free_points(block: Block, ellipsoid: Ellipsoid) -> Member:
     estimate = estimate_images(sums, images.prior, images.parameters)
     rows = np.arange(len(images), dtype=np.int32)
     state = SubMin(rows, estimate.theta, estimate.covariance, estimate.chi_square, sums.redundancy)
-    determined = (part.factors.rank == 3) & (np.bincount(rays.point[solved.accepted], minlength=len(ids)) >= 2)
-    own = np.where(determined[:, None, None], part.factors.own, 0.0)
-    determined &= np.trace(own, axis1=1, axis2=2) < DETERMINED_METRES**2
+    determined = determined_by(part.factors) & (np.bincount(rays.point[solved.accepted], minlength=len(ids)) >= 2)
     if not determined.any():
         raise InputError("none of its points is determined; expected points measured in two images or more")
     kept = np.flatnonzero(determined)
     loading = loadings([part], rows, images.parameters)[(3 * kept[:, None] + np.arange(3)).ravel()]
     try:
-        covariance = joint_covariance(loading, own[kept], estimate.covariance)
+        covariance = joint_covariance(loading, part.factors.own[kept], estimate.covariance)
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         raise NumericalError("the covariance of its points is not positive definite; check its rays and its a priori model") from None
-    passes = sorted({image.pass_id for image in block.images if shares_errors(block, image.sensor)})
+    model = block.a_priori
+    passes = {i.pass_id for i in block.images if model is not None and model.shares_errors(sensor_named(i.sensor).parameters)}
     cluster = positions(block.block_id, ids[kept], locate(part, state)[kept], covariance)
-    return Member(cluster, "images", tuple(passes), estimate.chi_square, sums.redundancy)
-
-
-def shares_errors(block: Block, sensor: str) -> bool:
-    """True when images of a sensor have errors in common with others of their pass."""
-    if block.a_priori is None:
-        return False
-    stated = [block.a_priori.of(parameter) for parameter in sensor_named(sensor).parameters]
-    return any(s.common_to_pass > 0.0 and s.sigma > 0.0 for s in stated)
+    return Member(cluster, "images", tuple(sorted(passes)), estimate.chi_square, sums.redundancy)

@@ -92,20 +92,6 @@ class NewRays:
         return np.bincount(np.repeat(np.arange(points), np.diff(self.linear.first))[rays], minlength=points)
 
 
-def joined(known: LinearRays, known_weight: Array, new: LinearRays, new_weight: Array) -> NewRays:
-    """Known and new rays of the same n points as one set, sorted by point."""
-    points = np.arange(len(known.first) - 1)
-    point = np.concatenate([np.repeat(points, np.diff(known.first)), np.repeat(points, np.diff(new.first))])
-    order = np.argsort(point, kind="stable")
-
-    def both(name: str) -> NDArray[np.generic]:
-        return np.asarray(np.concatenate([getattr(known, name), getattr(new, name)])[order])
-
-    linear = LinearRays(known.first + new.first, *(both(name) for name in ("image", "by_ground", "by_parameters", "y")))  # type: ignore[arg-type]
-    weight = np.concatenate([known_weight, new_weight])[order]
-    return NewRays(linear, weight, (np.arange(len(order)) >= len(known_weight))[order])
-
-
 @numba.njit(cache=True, error_model="numpy")
 def _work(most: int, p: int) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:
     """Arrays for the point with most rays: see `_rows_of_point`."""

@@ -181,6 +181,10 @@ class APriori:
             stated |= self.parameters.get(name, {})
         return _uncertainty(parameter.name, stated)
 
+    def shares_errors(self, parameters: Sequence[Parameter]) -> bool:
+        """True when some of the error of an image with these parameters is common to its pass."""
+        return any(stated.sigma > 0.0 and stated.common_to_pass > 0.0 for stated in map(self.of, parameters))
+
 
 _UNCERTAINTY = tuple(f.name for f in fields(Uncertainty))
 _PLAIN = APriori()
@@ -226,6 +230,11 @@ class ImagePrior:
     parameters: tuple[Parameter, ...]
     released: bool = False
     joint: JointRows | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def shares_errors(self) -> bool:
+        """True when some of the image's error is common to its pass."""
+        return self.a_priori is not None and self.a_priori.shares_errors(self.parameters)
 
 
 def correlation_factor(correlation: Array) -> Array:

@@ -103,7 +103,7 @@ def common_points(
     kept, parts = determined_parts(source, well_spread(source, [s for s in selections if s.cell.number in held], MOST_POINTS))
     if not parts:
         return None
-    mates = mates_in(tile) if any(_shares(prior) for prior in block.priors) else np.empty(0, dtype=np.int32)
+    mates = mates_in(tile) if any(prior.shares_errors for prior in block.priors) else np.empty(0, dtype=np.int32)
     seen = np.unique(np.concatenate([mates, *(part.linear.image for part in parts)])).astype(np.int32)
     found = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
     order = np.argsort(found, kind="stable")
@@ -115,11 +115,6 @@ def _marginal(state: SubMin, images: Index) -> SubMin:
     at, p = np.searchsorted(state.images, images), state.theta.shape[1]
     rows = (at[:, None] * p + np.arange(p)).ravel()
     return replace(state, images=images, theta=state.theta[at], covariance=state.covariance[np.ix_(rows, rows)])
-
-
-def _shares(prior: ImagePrior) -> bool:
-    """True for an image that may share an error with others of its pass."""
-    return prior.a_priori is not None and any(prior.a_priori.of(parameter).common_to_pass > 0.0 for parameter in prior.parameters)
 
 
 def _tile_of_most(source: NetworkSource, selections: Sequence[Selection]) -> int | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -249,13 +249,7 @@ def ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection,
     good = determined_by(point_factors)
     if not good.all():
         return ground_part(source, Selection(cell, selection.rows[good]))
-    rows = cell.images[linear.image]
-    part = GroundPart(
-        cell.origin[selection.rows],
-        type(linear)(linear.first, rows, linear.by_ground, linear.by_parameters, linear.y),
-        point_factors,
-    )
-    return selection, part
+    return selection, GroundPart(cell.origin[selection.rows], replace(linear, image=cell.images[linear.image]), point_factors)
 
 
 def determined_by(point_factors: PointFactors) -> NDArray[np.bool_]:

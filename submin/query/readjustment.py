@@ -64,7 +64,7 @@ def coupled_images(priors: Sequence[ImagePrior], usable: NDArray[np.bool_]) -> l
     links: list[tuple[int, int]] = []
     for i in np.flatnonzero(usable).tolist():
         keys = [("block", priors[i].block_id)]
-        keys += [("pass", priors[i].pass_id)] if _shares(priors[i]) else []
+        keys += [("pass", priors[i].pass_id)] if priors[i].shares_errors else []
         links += [(i, m + names.setdefault(key, len(names))) for key in keys]
     graph = sp.coo_array((np.ones(len(links)), tuple(np.array(links, dtype=np.int64).reshape(-1, 2).T)), shape=(m + len(names),) * 2)
     _, label = connected_components(graph, directed=False)
@@ -72,12 +72,6 @@ def coupled_images(priors: Sequence[ImagePrior], usable: NDArray[np.bool_]) -> l
     for i in np.flatnonzero(usable).tolist():
         groups.setdefault(int(label[i]), []).append(i)
     return [np.array(members, dtype=np.int32) for members in groups.values()]
-
-
-def _shares(image: ImagePrior) -> bool:
-    """True when some of an image's error is common to its pass."""
-    stated = [] if image.a_priori is None else [image.a_priori.of(parameter) for parameter in image.parameters]
-    return any(s.sigma > 0.0 and s.common_to_pass > 0.0 for s in stated)
 
 
 def readjust(

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.elimination import LinearRays, Sums
+from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.new_rays import NewRays
@@ -22,6 +22,7 @@ from submin.errors import QueryError
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.cell import Cell, RegisteredPoints, empty_cell, summed, with_rays
 from submin.network.low_rank import Fused, fuse, new_rays
+from submin.network.replay import joined
 from submin.network.sub_min import SubMin, add_sums
 from submin.query.block_control import both
 from submin.query.source import Index, NetworkSource, existing_cells
@@ -181,9 +182,5 @@ def _joined_cell(cell: Cell, block: BlockRays, rows: Index, chosen: NDArray[np.b
 
 def _together(parts: Sequence[NewRays]) -> NewRays:
     """New rays of several cells as one set."""
-    counts = np.concatenate([np.diff(part.linear.first) for part in parts])
-    image, by_ground, by_parameters, y = (
-        np.concatenate([getattr(part.linear, name) for part in parts]) for name in ("image", "by_ground", "by_parameters", "y")
-    )
-    linear = LinearRays(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), image, by_ground, by_parameters, y)
+    linear = joined([part.linear for part in parts])
     return NewRays(linear, np.concatenate([part.weight for part in parts]), np.concatenate([part.new for part in parts]))
