@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,8 +93,9 @@ def fuse_batch(
     """
     session, base = begin_change(where, version)
     refused = list(rejected)
-    accepted, tests = _stage_one(blocks, base, executor, reporter, refused, innovation)
-    blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, base, refused)
+    accepted, tests = _stage_one(blocks, base, executor, reporter, refused)
+    against = {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
+    blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, against, base, refused)
     ledger = Ledger.of(base)
     unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
     if not blocks and not unsaid:
@@ -129,7 +130,7 @@ def fuse_batch(
 
 
 def _stage_one(
-    blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected], innovation: float
+    blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected]
 ) -> tuple[dict[str, NDArray[np.bool_]], dict[str, BlockTest]]:
     """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of surveyed points.
 
@@ -145,8 +146,6 @@ def _stage_one(
         reason = outcome.reason or disagreement(outcome.accepted)
         if reason is None and outcome.test is not None:
             tests[outcome.block_id] = outcome.test
-            if outcome.test.rejected(innovation):
-                reason = outcome.test.reason(innovation, base.version)
         if reason is None:
             accepted[outcome.block_id] = outcome.accepted
         else:
@@ -182,15 +181,18 @@ def disagreement(accepted: NDArray[np.bool_]) -> str | None:
 
 
 def _register(
-    blocks: list[Block], accepted: dict[str, NDArray[np.bool_]], base: Snapshot, refused: list[Rejected]
+    blocks: list[Block], accepted: dict[str, NDArray[np.bool_]], against: Mapping[str, str], base: Snapshot, refused: list[Rejected]
 ) -> tuple[list[Block], Move]:
-    """Register the rays of the batch; a block that measures a known point elsewhere, or nothing inside the area, is rejected."""
+    """Register the rays of the batch; a block that measures a known point elsewhere, or nothing inside the area, is rejected.
+
+    So are then those that contradict the network as a whole (``against``: reason by block): where one point tells more, it is said.
+    """
     while True:
         rays = _arriving(blocks, accepted, base.image_count())
         move = place(
             base, take_points(base, np.unique(rays.point_ids)), rays, [image for block in blocks for image in network_images(block)]
         )  # fmt: skip
-        bad = _misplaced(blocks, rays, move)
+        bad = _misplaced(blocks, rays, move) or {k: against[b.block_id] for k, b in enumerate(blocks) if b.block_id in against}
         if not bad:
             return blocks, move
         refused.extend(Rejected.of(blocks[k], bad[k]) for k in sorted(bad))
