@@ -198,13 +198,12 @@ def plot(five: Joint, fitted: CompactCovariance, out: Path) -> None:
     d = np.linspace(0.0, 1.02 * chord.max(), 400)
     figure, axes = plt.subplots(1, 3, figsize=(11, 4.2), sharey=True, constrained_layout=True)
     for c, axis in enumerate(axes):
-        axis.plot(chord, matrix[c, c], ".", ms=2, color="0.6", label="pairs of points")
+        axis.plot(chord / 1000.0, matrix[c, c], ".", ms=2, color="0.6", label="pairs of points")
         for function, colour, name in (
             (rough[c], "C0", f"least squares (kappa {kappa:.1f})"), (fitted.functions[c], "C3", f"least kappa ({fitted.kappa:.1f})")
         ):  # fmt: skip
-            axis.plot(d, function(d), color=colour, label=name)
-        axis.set(title=f"{'xyz'[c]}-{'xyz'[c]} ({COMPONENTS[c]})", xlabel="distance, m", ylim=(0.0, 1.03), xlim=(0.0, d[-1]))
-        axis.ticklabel_format(axis="x", style="sci", scilimits=(5, 5))
+            axis.plot(d / 1000.0, function(d), color=colour, label=name)
+        axis.set(title=f"{'xyz'[c]}-{'xyz'[c]} ({COMPONENTS[c]})", xlabel="distance, km", ylim=(0.0, 1.03), xlim=(0.0, d[-1] / 1000.0))
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("correlation")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=4)

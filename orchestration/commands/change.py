@@ -178,10 +178,11 @@ def control_add(
     from orchestration.stopping import resumable
     from submin.storage.dense_reader import is_dense
     from submin.storage.network_store import Snapshot
-    from submin.storage.point_table import read_point_table
+    from submin.storage.point_table import check_stated_frame, read_point_table
 
-    table = read_point_table(points, "definite")
-    dense = is_dense(Snapshot.open(network))
+    table, snapshot = read_point_table(points, "definite"), Snapshot.open(network)
+    check_stated_frame(points, snapshot.metadata.frame, snapshot.metadata.epoch)
+    dense = is_dense(snapshot)
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(0 if dense else workers, scheduler) as executor:
         added = add_dense_control(table, network, reporter) if dense else add_control(table, str(points), network, executor, reporter)
     lines = [

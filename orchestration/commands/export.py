@@ -26,7 +26,7 @@ def export(
         float | None,
         typer.Option("--floor-km", help="Distance from which on the functions are zero, at most; for families with zero floor."),
     ] = None,
-    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci or rigorous.")] = "auto",
+    policy: Annotated[str, typer.Option("--policy", help="auto, tile, ci, bci, split or rigorous.")] = "auto",
     at: Annotated[str | None, typer.Option("--at", help="Version, such as v12.")] = None,
     max_points: Annotated[int | None, typer.Option("--max-points", help="At most so many points, well spread.")] = None,
     as_json: Json = False,

@@ -113,13 +113,37 @@ def _refuse_derived(path: Path) -> None:
         raise CatalogueError(f"{path}: has the {columns} of points that a network or an adjustment gave; {expected}")
 
 
+def check_stated_frame(path: str | Path, frame: str, epoch: str) -> None:
+    """Refuse points whose file states another frame or epoch than these; a file that states none is taken at its user's word.
+
+    Of two epochs one may be the beginning of the other's ISO 8601 text: a day, and a time of that day.
+
+    Raises
+    ------
+    CatalogueError
+        When the metadata of a Parquet file state another frame or epoch.
+    """
+    for name, ours in (("frame", frame), ("epoch", epoch)):
+        stated = _stated(Path(path), name)
+        same = stated == ours or (name == "epoch" and (stated.startswith(ours) or ours.startswith(stated)))
+        if stated and ours and not same:
+            raise CatalogueError(
+                f"{path}: {name} is {stated!r}, but the network's is {ours!r}; transform the points to the network's frame and epoch first"
+            )
+
+
 def _use(path: Path) -> str:
     """What a Parquet file says that its content may be used for."""
+    return _stated(path, "use")
+
+
+def _stated(path: Path, key: str) -> str:
+    """A text of the metadata of a Parquet file; empty for other files and without it."""
     try:
         metadata = pq.read_schema(path).metadata if path.suffix == ".parquet" else None
     except (pa.ArrowException, OSError):
         return ""  # whoever reads it says what is wrong with it
-    return bytes((metadata or {}).get(b"use", b"")).decode(errors="replace")
+    return bytes((metadata or {}).get(key.encode(), b"")).decode(errors="replace")
 
 
 def _covariances(table: pa.Table, path: Path, geodetic: Array, kind: Covariances) -> tuple[Array, Array | None]:
