@@ -20,6 +20,7 @@ from orchestration.progress import Reporter, Silent
 from orchestration.run import DEFAULT_BATCH_BLOCKS, check_frames
 from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
+from submin.errors import InputError
 from submin.formats.columns import required_path
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic
 from submin.network.network_image import image_set
@@ -28,6 +29,7 @@ from submin.storage.block_images import network_images
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks
+from submin.storage.dense_reader import refuse_dense
 from submin.storage.image_footprints import image_footprints
 from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
@@ -144,9 +146,14 @@ def plan(catalogue: Catalogue, place: str, *, batch_blocks: int = DEFAULT_BATCH_
     Raises
     ------
     InputError
-        When the catalogue breaks its contract, or its frame is not the network's.
+        When the catalogue breaks its contract or has no images, its frame is not the network's, or the network is a dense one.
     """
     reporter, snapshot = reporter or Silent(), Snapshot.open(place)
+    refuse_dense(snapshot, "plan")
+    if not catalogue.images:
+        raise InputError(
+            f"{catalogue.path}: has no images, of which a plan tells; 'submin run' takes its observations and control as they are"
+        )
     check_frames(catalogue, snapshot)
     catalogue.validate(measured=False)
     refused, tally = list[Rejected](), Tally()

@@ -31,8 +31,10 @@ def create(
     tile_km: Annotated[float | None, typer.Option("--tile-km", help="Side of a core; default 100, or 4 footprints with --fit.")] = None,
     overlap_km: Annotated[float | None, typer.Option("--overlap-km", help="Width that neighbours share, below the core's.")] = None,
     form: Annotated[str, typer.Option("--form", help="factored: images and points; dense: one tile of points alone.")] = "factored",
-    frame: Annotated[str, typer.Option("--frame", help="Frame of the coordinates; with --fit the catalogue's.")] = "WGS84",
-    epoch: Annotated[str, typer.Option("--epoch", help="Epoch of the frame; with --fit the catalogue's.")] = "",
+    frame: Annotated[
+        str | None, typer.Option("--frame", help="Frame of the coordinates; default WGS84, with --fit the catalogue's.")
+    ] = None,
+    epoch: Annotated[str | None, typer.Option("--epoch", help="Epoch of the frame; with --fit the catalogue's.")] = None,
     max_parameters: Annotated[
         int, typer.Option("--max-parameters", min=60, help="A tile that sees more image parameters (6 an image) is split into four.")
     ] = 2500,
@@ -54,10 +56,15 @@ def create(
 
     if sum(value is not None for value in (bbox, aoi, fit)) != 1:
         raise InputError("give the area by exactly one of --bbox, --aoi and --fit")
-    metadata = CatalogueMetadata(name="network", frame=frame, epoch=epoch)
+    metadata = CatalogueMetadata(name="network", frame=frame or "WGS84", epoch=epoch or "")
     if fit is not None:
         fitted = Catalogue.open(fit)
         metadata = fitted.metadata
+        for option, value, theirs in (("--frame", frame, metadata.frame), ("--epoch", epoch, metadata.epoch)):
+            if value is not None and value != theirs:
+                raise InputError(f"{option} is {value!r}, but that of the catalogue given by --fit is {theirs!r}; leave {option} out")
+        if form != "dense" and not fitted.images:
+            raise InputError(f"{fit}: has no images, so no footprints to fit tiles to; give the area by --bbox or --aoi, or --form dense")
         if form == "dense":
             area = fit_catalogue(fitted)[0] if fitted.images else fit_points(fitted)
         else:

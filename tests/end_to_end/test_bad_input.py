@@ -44,10 +44,12 @@ from submin.formats.tables import covariance_rows
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata
+from submin.storage.gnss_import import import_gnss
 from submin.storage.network_store import Snapshot, tag_version, versions
 from submin.storage.point_table import read_point_table
 from submin.storage.rpc_import import import_rpc
 from submin.storage.simulated import write_region
+from submin.storage.sinex_import import import_solution
 
 ROOT = Path(__file__).parents[2]
 TINY = RegionDesign(width_km=60, height_km=60, point_spacing_km=9.5)
@@ -1280,6 +1282,27 @@ simply("observation that is not a number", lambda w: w.observed(x=[float("nan")]
 simply("observation whose covariance is short", lambda w: w.observed(covariance_row=[[1.0] * 3]))
 simply("observation without an error of its own", lambda w: w.observed(covariance_row=[[1.0] * 9]))
 simply("cluster with the id of a block of images", lambda w: w.observed(cluster=[w.block()]))
+simply("baseline into a factored network", lambda w: w.observed(kind=["baseline"], to=["B"]))
+
+
+def measured_alone(w: World) -> Path:
+    """A catalogue of GNSS measurements alone."""
+    import_gnss(w.gnss()[2], w.new)
+    return w.new
+
+
+simply("tiles fitted to a catalogue without images", lambda w: ["create", w.folder / "tiled", "--fit", measured_alone(w)])
+simply(
+    "another frame than that of the fitted catalogue", lambda w: ["create", w.folder / "tiled", "--fit", w.catalogue, "--frame", "ITRF2014"]
+)
+simply("plan of a catalogue without images", lambda w: ["plan", measured_alone(w), w.network])
+simply("plan of a run into a dense network", lambda w: ["plan", w.catalogue, w.dense()])
+
+
+@case("control of another frame than the network's")
+def _(w: World) -> list[Any]:
+    import_solution(w.sinex()[2], w.folder / "control.parquet", frame="ITRF2014")
+    return ["control", "add", w.network, w.folder / "control.parquet"]
 
 
 def refused(world: World, words: list[Any], row: Row, call: Call) -> None:
