@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 
 DENSE = 400
 """Matrices up to this size are solved whole; of larger ones the leading eigenvalues by Lanczos' method."""
-MARGIN = 1e-9
-"""Part by which a factor is enlarged against the round-off of whoever forms P_hat again; more where that does not suffice."""
+MARGIN = 1e-8
+"""Part by which a bound is enlarged against the round-off of whoever forms it again; the factor by more where that does not suffice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ def consistent_bound(covariance: Array, correlations: Array, rank: int = 0) -> B
     if not 0 <= rank < size:
         raise InputError(f"rank is {rank}; expected 0 to {size - 1} for {size // 3} points")
     values, vectors = leading(covariance, lower_factors(correlations), rank + 1)
-    directions = vectors[:, :rank] * np.sqrt(np.maximum(values[:rank] - values[rank], 0.0))
+    directions = vectors[:, :rank] * np.sqrt((1.0 + MARGIN) * np.maximum(values[:rank] - values[rank], 0.0))
     alone = _certified(covariance, correlations, values[0], directions[:, :0])
     factor = alone if rank == 0 else _certified(covariance, correlations, values[rank], directions)
     return Bound(factor, alone, directions, float(factor + (directions**2).sum() / size))

@@ -221,8 +221,8 @@ def test_correlated_control_is_one_set(survey: tuple[dict[str, Array], list[Clus
     table = point_table(at, ids, joint)
     before = submin.open(place).query(tile="r000c000").covariance
     added = add_dense_control(table, str(place))
-    assert (added.fused, added.skipped, added.rejected) == (1, 0, ())
-    assert add_dense_control(table, str(place)).skipped == 1
+    assert (added.fused, added.skipped, added.rejected) == (3, 0, ())
+    assert add_dense_control(table, str(place)).skipped == 3
     after = submin.open(place).query(tile="r000c000").covariance
     assert np.linalg.eigvalsh(before - after)[0] > -1e-9 * np.trace(before)
     set_of_points = Cluster("control:p010 and 2 more", np.array(ids), np.full(3, ""), np.stack([at[i] for i in ids]), joint)
@@ -231,6 +231,8 @@ def test_correlated_control_is_one_set(survey: tuple[dict[str, Array], list[Clus
     assert "with other values" in add_dense_control(moved, str(place)).rejected[0].reason
     facts = describe(submin.open(place))
     assert facts["control_points"] == 3
+    alone = add_dense_control(point_table(at, ["p020"]), str(place))
+    assert "p020 is control of the network already" in alone.rejected[0].reason
     found = check(submin.open(place), point_table(at, [*ids, "p040", "p050"]), "rigorous")
     assert (found.control_left_out, found.accuracy.points, found.policy) == (3, 2, "tile")
     assert withdraw_dense(str(place), control="p030").rays == 3
