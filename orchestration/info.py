@@ -71,7 +71,6 @@ def _describe_dense(network: Network, dense: DenseReader) -> dict[str, Any]:
         "variance_factor": points.chi_square / degrees if degrees else float("nan"),
         "ce90_median": float(np.median(dense.ce90())) if len(points.ids) else float("nan"),
         "le90_median": float(np.median(dense.le90())) if len(points.ids) else float("nan"),
-        "tile_km": network.cover.core / 1000.0,
         "frame": snapshot.metadata.frame,
         "bytes": _size(snapshot.place),
     }

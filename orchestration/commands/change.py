@@ -76,8 +76,11 @@ def create(
     made = make(network, area, metadata, tile_km, overlap_km, form, max_parameters, thin_metres)
     cover = made.cover
     thinned = "" if thin_metres is None else f", one point reported in each square of {thin_metres:g} m"
-    show(made.to_json(), as_json, f"{network}: {counted(cover.tile_count, 'tile')} ({cover.rows} rows, {cover.columns} columns), "
-         f"cores of {cover.core / 1000:g} km, overlap {cover.overlap / 1000:g} km, frame {metadata.frame}{thinned}")  # fmt: skip
+    tiles = "one vector of points" if form == "dense" else (
+        f"{counted(cover.tile_count, 'tile')} ({cover.rows} rows, {cover.columns} columns), "
+        f"cores of {cover.core / 1000:g} km, overlap {cover.overlap / 1000:g} km"
+    )  # fmt: skip
+    show(made.to_json(), as_json, f"{network}: {tiles}, frame {metadata.frame}{thinned}")
 
 
 @app.command()
@@ -150,7 +153,7 @@ def _run_dense(catalogue: Catalogue, network: str, batch_blocks: int, as_json: b
 
     with resumable(network), progress_bars(quiet=as_json) as reporter:
         done = run_dense(catalogue, network, batch_blocks=batch_blocks, reporter=reporter)
-    counts = f"{done.control_fused} of control, {done.skipped} already there, {len(done.rejected)} rejected"
+    counts = f"{counted(done.control_fused, 'control point')} added, {done.skipped} already there, {len(done.rejected)} rejected"
     lines = [f"{network} {done.version}: {counted(done.fused, 'block')} fused, {counts}"]
     if not (done.fused or done.control_fused or done.rejected):
         lines[0] = f"{network} {done.version}: nothing is left to do, all {counted(done.skipped, 'block')} are in the network"
