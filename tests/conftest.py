@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from real_data import real_data
 
 # One BLAS thread, as every worker has: matrices are small here, and two threads on two busy cores wait for each other.
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -16,16 +17,8 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 settings.register_profile("submin", deadline=None)
 settings.load_profile("submin")
 
-ROOT = Path(__file__).parents[1]
-
 
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Folder of the real data; without it the test is skipped visibly, and in CI it fails."""
-    folder = Path(os.environ.get("SUBMIN_DATA", ROOT.parent / "shared" / "data"))
-    if not folder.is_dir():
-        message = f"real data not found in {folder}: set SUBMIN_DATA to their folder"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
-    return folder
+    return real_data()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import gzip
-import os
 import struct
 from itertools import pairwise
 from pathlib import Path
@@ -12,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from real_data import FOLDER
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-WORLD = Path(os.environ.get("SUBMIN_DATA", Path(__file__).parents[2] / "shared" / "data")) / "footprints_world"
+WORLD = FOLDER / "footprints_world"
 
 
 def continents() -> dict[str, BaseGeometry]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import shapely
 from networks import area_of, rewrite
-from outlines import WORLD, landsat_rings
+from outlines import landsat_rings
 
 import submin
 from orchestration.cli import main
@@ -165,8 +165,9 @@ def test_control_of_the_catalogue_takes_part(region: SimulatedRegion, catalogue:
     compare(planned, network)
 
 
-@pytest.mark.skipif(not WORLD.exists(), reason="needs the footprints of SUBMIN_DATA")
-def test_images_without_measurements_go_to_every_tile_that_they_meet(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
+def test_images_without_measurements_go_to_every_tile_that_they_meet(
+    region: SimulatedRegion, catalogue: Path, tmp_path: Path, data: Path
+) -> None:
     # Landsat scenes over Morocco; only their footprints are real: the camera is any
     rings = [r for r in landsat_rings() if (r[:, 0] > -14).all() and (r[:, 0] < 1).all() and (r[:, 1] > 27).all() and (r[:, 1] < 37).all()]
     assert len(rings) > 40

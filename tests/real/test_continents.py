@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from outlines import WORLD, continents, landsat_rings
+from outlines import continents, landsat_rings
+from real_data import real_data
 from shapely.geometry.base import BaseGeometry
 
 import submin
@@ -19,8 +20,7 @@ from orchestration.cli import main
 from submin.tiling.cover import Cover, cover_area
 from submin.tiling.footprints import FootprintIndex, in_plane
 
-if not WORLD.exists():
-    pytest.skip("needs the footprints and outlines of SUBMIN_DATA", allow_module_level=True)
+real_data(whole_module=True)
 
 AREAS = continents()
 MILLIONS_OF_KM2 = {
