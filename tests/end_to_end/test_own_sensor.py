@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from conftest import ROOT
 from networks import fuse
 from numpy.typing import NDArray
 
