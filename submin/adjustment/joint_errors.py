@@ -71,9 +71,13 @@ def joint_errors(covariance: Array, share: float = 0.5) -> JointErrors:
 
 
 def marginal_factor(rows: Array) -> Array:
-    """A factor (r, k) of ``rows rows'`` of some rows (r, q) of a factor, with no more columns than rows."""
+    """A factor (r, k) of ``rows rows'`` of some rows (r, q) of a factor, with no more columns than rows.
+
+    Its sign is fixed, so that it means the same on every machine.
+    """
     used = rows[:, np.flatnonzero(rows.any(axis=0))]
     if used.shape[1] <= used.shape[0]:
         return used
     (upper,) = la.qr(used.T, mode="r", overwrite_a=True, check_finite=False)
-    return np.ascontiguousarray(upper[: len(rows)].T)
+    lower = upper[: len(rows)].T
+    return np.ascontiguousarray(lower * np.where(np.diagonal(lower) < 0.0, -1.0, 1.0))

@@ -236,11 +236,38 @@ class ImagePrior:
         """True when some of the image's error is common to its pass."""
         return self.a_priori is not None and self.a_priori.shares_errors(self.parameters)
 
+    @property
+    def correlated(self) -> bool:
+        """True when the own error of the image is correlated with those of its block, or set."""
+        if self.a_priori is None:
+            return self.joint is not None
+        return any(stated.sigma > 0.0 and stated.correlation != "none" for stated in (_stated(self.a_priori, p) for p in self.parameters))
+
 
 def correlation_factor(correlation: Array) -> Array:
-    """``F`` with ``F F' = correlation``, by eigenvalues, negative ones (round-off) clipped to zero."""
+    """The symmetric root ``F`` with ``F F' = correlation``, by eigenvalues, negative ones (round-off) clipped to zero.
+
+    The symmetric one does not depend on which eigenvectors a library returns: whitened vectors mean the same on every machine.
+    """
     values, vectors = np.linalg.eigh(correlation)
-    return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None)))
+    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedColumns:
+    """What the columns of an a priori factor are: columns of the images' own first, then those of passes, then those of sets.
+
+    Attributes
+    ----------
+    image, parameter : (k,) image and parameter that each of the first columns belongs to; in a correlated block it moves other images too
+    passes : pass and name of the parameter of each of the columns that follow
+    sets : block of each set of correlated control, and how many columns it has
+    """
+
+    image: NDArray[np.int64]
+    parameter: NDArray[np.int64]
+    passes: tuple[tuple[str, str], ...]
+    sets: tuple[tuple[str, int], ...]
 
 
 def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
@@ -251,6 +278,11 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
     parameters are zero, as are those that its sensor does not have. Images may be any subset of a network: ``K K'`` is then the marginal
     of the whole prior.
     """
+    return prior_and_columns(images, parameters)[0]
+
+
+def prior_and_columns(images: Sequence[ImagePrior], parameters: int) -> tuple[sp.csr_array, WhitenedColumns]:
+    """The factor of `prior_factor`, and what its columns are."""
     m, p, columns = len(images), parameters, 0
     sets: dict[str, list[int]] = {}
     own_column: dict[tuple[int, int], int] = {}
@@ -290,13 +322,16 @@ def prior_factor(images: Sequence[ImagePrior], parameters: int) -> sp.csr_array:
         rows, sigmas = zip(*members_of_pass, strict=True)
         entries.add(np.array(rows), np.array([columns + k]), np.array(sigmas)[:, None])
     columns += len(shared)
-    for members in sets.values():
+    widths = []
+    for block_id, members in sets.items():
         views = [(i, joint.rows) for i in members if (joint := images[i].joint) is not None]
         factor = marginal_factor(np.concatenate([rows for _, rows in views]))
         at = np.concatenate([i * p + np.arange(len(rows)) for i, rows in views])
         entries.add(at, columns + np.arange(factor.shape[1]), factor)
         columns += factor.shape[1]
-    return entries.factor((m * p, columns))
+        widths.append((block_id, factor.shape[1]))
+    own = np.array(list(own_column), dtype=np.int64).reshape(-1, 2)
+    return entries.factor((m * p, columns)), WhitenedColumns(own[:, 0], own[:, 1], tuple(shared), tuple(widths))
 
 
 def prior_variance(prior: sp.csr_array, parameters: int) -> Array:
