@@ -111,3 +111,68 @@ def between(factor: sp.csr_array, full: Array, *, transposed: bool = False) -> A
     out = np.empty((rows.shape[0], rows.shape[0]))
     _between(rows.indptr.astype(np.int64), rows.indices.astype(np.int32), rows.data, full, out)
     return fill_symmetric(out)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pack(lower: Array, out: Array) -> None:
+    k = 0
+    for i in range(len(lower)):
+        for j in range(i + 1):
+            out[k] = lower[i, j]
+            k += 1
+
+
+def packed(lower: Array) -> Array:
+    """Lower triangle (n (n + 1) / 2,), row by row, of a matrix (n, n); what stands above the diagonal takes no part."""
+    out = np.empty(len(lower) * (len(lower) + 1) // 2)
+    _pack(lower, out)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _unpack(values: Array, out: Array) -> None:
+    k = 0
+    for i in range(len(out)):
+        for j in range(i + 1):
+            out[i, j] = values[k]
+            k += 1
+
+
+def unpacked(values: Array) -> Array:
+    """Lower triangular matrix (n, n) of `packed`; zeros above the diagonal."""
+    size = (int(np.sqrt(8 * values.size + 1)) - 1) // 2
+    out = np.zeros((size, size))
+    _unpack(values, out)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_packed(total: Array, values: Array, at: Rows) -> None:
+    k = 0
+    for i in range(len(at)):
+        for j in range(i + 1):
+            if at[i] >= at[j]:
+                total[at[i], at[j]] += values[k]
+            else:
+                total[at[j], at[i]] += values[k]
+            k += 1
+
+
+def add_packed(total: Array, values: Array, at: NDArray[np.integer]) -> None:
+    """Add a packed lower triangle to rows and columns ``at``, in any order, of the lower triangle of a larger one, in place."""
+    _add_packed(total, values, np.asarray(at, dtype=np.int64))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _take(values: Array, at: Rows, out: Array) -> None:
+    for i in range(len(at)):
+        for j in range(i + 1):
+            high, low = max(at[i], at[j]), min(at[i], at[j])
+            out[i, j] = out[j, i] = values[high * (high + 1) // 2 + low]
+
+
+def taken(values: Array, at: NDArray[np.integer]) -> Array:
+    """Rows and columns ``at`` (k,), in any order, of a packed symmetric matrix, both triangles (k, k)."""
+    out = np.empty((len(at), len(at)))
+    _take(values, np.asarray(at, dtype=np.int64), out)
+    return out

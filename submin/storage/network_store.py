@@ -24,6 +24,7 @@ from submin.network.network_image import NetworkImage
 from submin.network.sub_min import SubMin
 from submin.storage.arrays import attributes_of, create_table, group_of, hash_ids, read_record, read_table, table_length
 from submin.storage.schema import (
+    CHANGE_COLUMNS,
     DIRECTORY_COLUMNS,
     FLAG_COLUMNS,
     IMAGE_COLUMNS,
@@ -111,6 +112,7 @@ def create_network(place: str, metadata: NetworkMetadata, begin: Callable[[zarr.
         create_table(root, "ledger", LEDGER_COLUMNS)
         create_table(root, "directory", DIRECTORY_COLUMNS)
         create_table(root, "flags", FLAG_COLUMNS)
+        create_table(root, "changes", CHANGE_COLUMNS)
         if begin is not None:
             begin(root)
         session.commit("created", metadata={"version": 0})

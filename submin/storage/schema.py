@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from submin.adjustment.elimination import Sums
 from submin.adjustment.priors import JointRows
 from submin.adjustment.rays import Rays
-from submin.adjustment.symmetric import fill_symmetric
+from submin.adjustment.symmetric import fill_symmetric, packed, unpacked
 from submin.errors import StoreError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, widened
@@ -22,7 +22,7 @@ from submin.network.sub_min import SubMin, wider
 from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 COVARIANCE_CHUNK = 256
 
 IMAGE_COLUMNS = {
@@ -41,6 +41,8 @@ JOINT_CHUNK = 256
 FLAG_COLUMNS = {"tile": "int64", "image": "int64"}
 """Which tile finds the camera of which image bad; the prior of an image is released while any tile says so."""
 DIRECTORY_COLUMNS = {"hash": "uint64", "cell": "int64"}
+CHANGE_COLUMNS = {"tile": "int64", "changed": "int64", "lost": "int64"}
+"""Versions in which a tile's own cells last changed, and last lost something that they had counted (decision 014)."""
 
 
 @dataclass(frozen=True)
@@ -95,19 +97,6 @@ class NetworkMetadata:
         return cls(**values)
 
 
-def pack_lower(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lower triangle, row by row."""
-    return np.asarray(matrix[np.tril_indices(len(matrix))])
-
-
-def unpack_lower(packed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lower triangular matrix from `pack_lower`; zeros above the diagonal."""
-    size = (int(np.sqrt(8 * packed.size + 1)) - 1) // 2
-    matrix = np.zeros((size, size))
-    matrix[np.tril_indices(size)] = packed
-    return matrix
-
-
 def write_cell(root: zarr.Group, name: str, cell: Cell, square_px: float, pixel_rays: int) -> None:
     """Write a cell, replacing its earlier state.
 
@@ -119,7 +108,7 @@ def write_cell(root: zarr.Group, name: str, cell: Cell, square_px: float, pixel_
         {
             "point_ids": cell.point_ids, "ray_point": rays.point, "ray_image": rays.image, "accepted": rays.accepted,
             "images": cell.images, "origin": cell.origin, "linearised_at": cell.linearised_at, "theta": cell.theta,
-            "observed": rays.observed, "sigma": rays.sigma, "vector": sums.vector, "information": pack_lower(sums.information),
+            "observed": rays.observed, "sigma": rays.sigma, "vector": sums.vector, "information": packed(sums.information),
         },
         {"number": cell.number, "misclosure": sums.misclosure, "redundancy": sums.redundancy,
          "points": len(cell.point_ids), "determined": int(determined(cell).sum()), "rays": len(rays), "accepted": int(rays.accepted.sum()),
@@ -153,7 +142,7 @@ def read_cell(group: zarr.Group, parameters: int, *, with_sums: bool = True) -> 
 def read_sums_of(group: zarr.Group, parts: dict[str, NDArray[Any]]) -> Sums:
     """Sums among the parts of a cell's record."""
     attributes = attributes_of(group)
-    return Sums(unpack_lower(parts["information"]), parts["vector"], float(attributes["misclosure"]), int(attributes["redundancy"]))
+    return Sums(unpacked(parts["information"]), parts["vector"], float(attributes["misclosure"]), int(attributes["redundancy"]))
 
 
 def write_sub_min(root: zarr.Group, name: str, sub_min: SubMin, cells: Sequence[int]) -> None:
@@ -163,11 +152,23 @@ def write_sub_min(root: zarr.Group, name: str, sub_min: SubMin, cells: Sequence[
         {"images": sub_min.images, "cells": np.array(cells, dtype=np.int64), "theta": sub_min.theta},
         {"chi_square": sub_min.chi_square, "redundancy": sub_min.redundancy},
     )  # fmt: skip
-    size = len(sub_min.covariance)
+    write_symmetric(group, "covariance", sub_min.covariance)
+
+
+def write_symmetric(group: zarr.Group, name: str, matrix: NDArray[np.float64]) -> None:
+    """Write a symmetric matrix as an array of square chunks, of which only those on and below the diagonal are written."""
+    size = len(matrix)
     chunk = min(COVARIANCE_CHUNK, max(size, 1))
-    array = group.create_array("covariance", shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=None)
+    array = group.create_array(name, shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=None)
     for start in range(0, size, chunk):
-        array[start : start + chunk, : start + chunk] = sub_min.covariance[start : start + chunk, : start + chunk]
+        array[start : start + chunk, : start + chunk] = matrix[start : start + chunk, : start + chunk]
+
+
+def read_symmetric(group: zarr.Group, name: str, rows: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+    """A matrix of `write_symmetric`, both triangles: all of it, or some rows (ascending) and the same columns."""
+    array = array_of(group, name)
+    lower = np.asarray(array[:, :] if rows is None or len(rows) == array.shape[0] else array.oindex[rows, rows])
+    return fill_symmetric(np.ascontiguousarray(lower))
 
 
 def read_sub_min(group: zarr.Group, parameters: int, images: NDArray[np.int32] | None = None) -> SubMin:
@@ -180,11 +181,9 @@ def read_sub_min(group: zarr.Group, parameters: int, images: NDArray[np.int32] |
     chosen = np.arange(len(held)) if images is None else np.flatnonzero(np.isin(held, images))
     p = theta.shape[1]
     rows = (chosen[:, None] * p + np.arange(p)).ravel()
-    array = array_of(group, "covariance")
-    covariance = np.asarray(array[:, :] if len(chosen) == len(held) else array.oindex[rows, rows])
     attributes = attributes_of(group)
     sub_min = SubMin(
-        held[chosen], theta[chosen], fill_symmetric(np.ascontiguousarray(covariance)),
+        held[chosen], theta[chosen], read_symmetric(group, "covariance", rows),
         float(attributes["chi_square"]), int(attributes["redundancy"]),
     )  # fmt: skip
     return wider(sub_min, parameters)

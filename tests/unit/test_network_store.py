@@ -28,8 +28,6 @@ from submin.storage.schema import (
     IMAGE_COLUMNS,
     LEDGER_COLUMNS,
     NetworkMetadata,
-    pack_lower,
-    unpack_lower,
     write_cell,
     write_sub_min,
 )
@@ -504,14 +502,6 @@ def test_ledger_comes_back(tmp_path: Path) -> None:
     write(place, 1, lambda root: append_table(group_of(root, "ledger"), content))
     found = Snapshot.open(place).ledger(["status", "rays"])
     assert {name: values.tolist() for name, values in found.items()} == {"status": ["fused", "rejected"], "rays": [3, 4]}
-
-
-@pytest.mark.parametrize("size", [0, 1, 2, 3, 50, 600])
-def test_packed_triangle_comes_back(size: int) -> None:
-    lower = np.tril(np.random.default_rng(size).normal(size=(size, size)))
-    packed = pack_lower(lower)
-    assert packed.shape == (size * (size + 1) // 2,)
-    np.testing.assert_array_equal(unpack_lower(packed), lower)
 
 
 def test_a_change_starts_from_the_version_that_its_ledger_was_read_from(tmp_path: Path) -> None:

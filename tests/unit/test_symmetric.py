@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from submin.adjustment import symmetric
-from submin.adjustment.symmetric import add_into, between, fill_symmetric, permuted
+from submin.adjustment.symmetric import add_into, add_packed, between, fill_symmetric, packed, permuted, taken, unpacked
 
 P = 3
 
@@ -60,3 +60,22 @@ def test_a_triangle_in_the_order_of_lapack_is_filled_too() -> None:
     lower[np.triu_indices(150, 1)] = np.nan  # LAPACK leaves it undefined
     found = fill_symmetric(lower)
     np.testing.assert_array_equal(found, np.tril(lower) + np.tril(lower, -1).T)
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 3, 50, 600])
+def test_packed_triangle_comes_back(size: int) -> None:
+    lower = np.tril(np.random.default_rng(size).normal(size=(size, size)))
+    values = packed(lower)
+    assert values.shape == (size * (size + 1) // 2,)
+    np.testing.assert_array_equal(unpacked(values), lower)
+
+
+def test_packed_triangle_added_and_taken_in_any_order() -> None:
+    rng = np.random.default_rng(5)
+    part, total = np.tril(rng.normal(size=(4, 4))), np.tril(rng.normal(size=(7, 7)))
+    at = np.array([5, 0, 6, 2])
+    expected = fill_symmetric(total.copy())
+    expected[np.ix_(at, at)] += fill_symmetric(part.copy())
+    add_packed(total, packed(part), at)
+    np.testing.assert_allclose(fill_symmetric(total.copy()), expected, rtol=1e-15)
+    np.testing.assert_array_equal(taken(packed(total), at), fill_symmetric(total.copy())[np.ix_(at, at)])
