@@ -6,7 +6,7 @@ write to forks of its session (docs/architecture.md). A crash anywhere before th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import icechunk
@@ -25,6 +25,7 @@ from submin.storage.arrays import append_table, group_of, hash_ids, replace_tabl
 from submin.storage.catalogue_schema import ImageRecord
 from submin.storage.ledger import Entry, append_entries
 from submin.storage.network_store import Snapshot, commit
+from submin.storage.reconciled import EVERYWHERE, TILE_STATES, Changes, note_changes
 from submin.storage.schema import image_columns, write_joint
 from submin.tiling.cover import Cover
 
@@ -78,12 +79,14 @@ class Settled:
     Attributes
     ----------
     reports : of the judged tiles
+    changes : what becomes of the states that tiles were reconciled to
     flags : pairs of tile and image row: the tile finds the image's camera bad
     gone : cells and tiles to be deleted, because nothing is left of them
     rejected : rays (m,) by image row, in the cells that were judged
     """
 
     reports: tuple[TileReport, ...]
+    changes: Changes
     flags: frozenset[tuple[int, int]]
     gone: tuple[str, ...]
     rejected: NDArray[np.int64]
@@ -209,12 +212,14 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     arrivals, departures = move.registration.arrivals, move.out.departures
     tiles = _touched_tiles(cover, move.out, move.registration)
     shared = executor.share(list(move.images))
+    origins = _origins(move)
     arguments = []
     for tile in tiles:
         held = move.cover.cells_held(tile)
         arguments.append((
             session.fork(), tile, cover,  # a fork each: a task must see the last version, not what another task writes
-            {c: arrivals[c] for c in held if c in arrivals}, {c: departures[c] for c in held if c in departures}, shared,
+            {c: arrivals[c] for c in held if c in arrivals}, {c: departures[c] for c in held if c in departures},
+            {c: origins[c] for c in move.cover.cells_owned(tile) if c in origins}, shared,
         ))  # fmt: skip
     updates = executor.submit_all(update_tile, arguments, "update-tile", reporter.stage("summing tiles", len(tiles)))
     by_tile = dict(zip(tiles, updates, strict=True))
@@ -240,9 +245,40 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     gone = [f"cells/{move.cover.cell_name(c)}" for report in reports for c, cell in report.cells.items() if not len(cell.images)]
     gone += [f"cells/{name}" for name in sorted(move.out.dissolved)]
     gone += [f"tiles/{move.cover.tile_name(t.tile)}" for t in factored if not t.images]
-    gone += [f"tiles/{base.cover.tile_name(t)}" for t in split if t not in base.cover.splits]
+    for tile in split - {*base.cover.splits}:
+        gone += [f"{group}/{base.cover.tile_name(tile)}" for group in ("tiles", TILE_STATES)]
     rejected = _rejected_rays((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
-    return Settled(tuple(reports), frozenset(flags), tuple(gone), rejected)
+    return Settled(tuple(reports), _changes(base, move, reports, origins), frozenset(flags), tuple(gone), rejected)
+
+
+def _origins(move: Move) -> dict[int, tuple[int, ...]]:
+    """For each cell at which points arrive from other cells that are still there: these cells."""
+    names = np.concatenate([np.empty(0, dtype="U1"), *move.out.departures.values()])
+    left = np.repeat(np.array(list(move.out.departures), dtype=np.int64), [len(ids) for ids in move.out.departures.values()])
+    order = np.argsort(names)
+    found = {}
+    for cell, arriving in move.registration.arrivals.items():
+        known = np.isin(arriving.point_ids, names)
+        came_from = left[order[np.searchsorted(names, arriving.point_ids[known], sorter=order)]]
+        if others := set(came_from.tolist()) - {cell}:
+            found[cell] = tuple(sorted(others))
+    return found
+
+
+def _changes(base: Snapshot, move: Move, reports: Sequence[TileReport], origins: Mapping[int, Sequence[int]]) -> Changes:
+    """What a move does to reconciled states (decision 014).
+
+    A point that moves to a cell which a tile holds, from one that it does not, is in the tile's state already.
+    """
+    cover = move.cover
+    lost = {report.tile for report in reports if report.lost}
+    lost |= {base.cover.owner(c) for c in base.cell_numbers() if base.cover.cell_name(c) in move.out.dissolved}
+    arriving = np.concatenate([np.empty(0, dtype="U1"), *(a.point_ids for a in move.registration.arrivals.values())])
+    lost |= {cover.owner(c) for c, ids in move.out.departures.items() if not np.isin(ids, arriving).all()}
+    if any(report.lost_elsewhere for report in reports):
+        lost.add(EVERYWHERE)
+    stale = {tile for to, cells in origins.items() for c in cells for tile in set(cover.holders(to)) - set(cover.holders(c))}
+    return Changes(frozenset(report.tile for report in reports if report.changed), frozenset(lost), frozenset(stale))
 
 
 def finish(
@@ -268,6 +304,7 @@ def finish(
     write_joint(root, move.images)
     set_rows(group_of(root, "images"), "withdrawn", np.array(withdrawn, dtype=np.int64), np.ones(len(withdrawn), dtype=np.uint8))
     _write_flags(root, settled.flags, base.flags())
+    note_changes(root, base, version, settled.changes)
     append_entries(group_of(root, "ledger"), entries)
     ids, at = move.registration.directory
     listed = (at >= 0) & (base.candidate_cells(ids) != at)

@@ -22,7 +22,7 @@ from submin.adjustment.status import Cause, Status
 from submin.adjustment.surveyed_points import ContradictedPoint, contradicted_points
 from submin.errors import NumericalError, SubminError
 from submin.geodesy import Ellipsoid
-from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, summed, union_of_images, with_points, without_points
+from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, loses, summed, union_of_images, with_points, without_points
 from submin.network.innovation import BlockTest
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import SubMin, add_sums, factor
@@ -95,11 +95,20 @@ class TileUpdate:
 
 @dataclass(frozen=True)
 class TileReport:
-    """The part of a tile's update that the coordinator keeps."""
+    """The part of a tile's update that the coordinator keeps.
+
+    Attributes
+    ----------
+    changed : own cells that are summed anew; cells : counts of all own cells
+    lost : True when a ray that gave information in an own cell does not any more; lost_elsewhere : so did one of a point that came from
+        another cell
+    """
 
     tile: int
     changed: tuple[int, ...]
     cells: dict[int, CellReport]
+    lost: bool
+    lost_elsewhere: bool
     flagged: tuple[FlaggedImage, ...]
     contradicted: tuple[ContradictedPoint, ...]
     converged: bool
@@ -224,6 +233,7 @@ def update_tile(
     cover: Cover,
     arrivals: Mapping[int, RegisteredPoints],
     departures: Mapping[int, NDArray[np.str_]],
+    origins: Mapping[int, Sequence[int]],
     new_images: Sequence[NetworkImage],
 ) -> TileUpdate:
     """Judge the rays that a tile holds, and sum its own cells.
@@ -231,12 +241,14 @@ def update_tile(
     All rays that the tile holds are adjusted together (they include the neighbours' rays in shared cells); the tile decides only for the
     points of its own core. What comes out depends on the rays alone: every ray and image is judged afresh, also one rejected or released
     on less evidence, from the registered positions, images in the order of their ids (decision 006).
+
+    ``origins`` are other cells from which points arrive, by the own cell to which they go.
     """
     root = zarr.open_group(writes.store, mode="r+")
     snapshot = Snapshot(root, "network", cover, width_of(image.sensor for image in new_images))
-    held = []
+    held, before = [], {}
     for number in cover.cells_held(tile):
-        cell = snapshot.cell(number)
+        before[number] = cell = snapshot.cell(number)
         if number in departures:
             cell = without_points(cell, departures[number])
         if number in arrivals:
@@ -247,7 +259,7 @@ def update_tile(
     if not len(seen):  # the last ray has gone
         emptied = {cell.number: CellReport.empty() for cell in held if Cover.owner(cell.number) == tile}
         nothing = {number: (seen, empty_sums(0, snapshot.metadata.parameters)) for number in emptied}
-        return TileUpdate(tile, nothing, TileReport(tile, tuple(emptied), emptied, (), (), True, writes))
+        return TileUpdate(tile, nothing, TileReport(tile, tuple(emptied), emptied, True, False, (), (), True, writes))
     members = sorted(zip(_images(snapshot, seen, new_images), seen.tolist(), strict=True), key=lambda member: member[0].image_id)
     rows = np.array([row for _, row in members], dtype=np.int32)
     images = image_set(
@@ -264,6 +276,7 @@ def update_tile(
 
     sums: dict[int, tuple[NDArray[np.int32], Sums]] = {}
     reports: dict[int, CellReport] = {}
+    lost = lost_elsewhere = False
     ray_at = np.cumsum([0, *(len(cell.rays) for cell in held)])
     point_at = np.cumsum([0, *(len(cell) for cell in held)])
     place = np.argsort(rows)
@@ -282,9 +295,12 @@ def update_tile(
                 write_cell(root, cover.cell_name(cell.number), new, float(squares[own_rays].sum()), counted)
             sums[cell.number] = (new.images, new.sums)
         reports[cell.number] = _report(judged)
+        lost |= loses(before[cell.number], judged)
+        lost_elsewhere |= any(loses(snapshot.cell(origin), judged) for origin in origins.get(cell.number, ()))
     own = np.concatenate([np.full(len(cell), Cover.owner(cell.number) == tile) for cell in held])
     contradicted = contradicted_points(images, together.rays, result, np.concatenate([cell.point_ids for cell in held]), own)
-    report = TileReport(tile, tuple(sums), reports, _flagged(result, images, rows), contradicted, result.converged, writes)
+    flagged = _flagged(result, images, rows)
+    report = TileReport(tile, tuple(sums), reports, lost, lost_elsewhere, flagged, contradicted, result.converged, writes)
     return TileUpdate(tile, sums, report)
 
 

@@ -1,15 +1,16 @@
-"""Commands that make a network and change it: create, run, control add, withdraw, tag."""
+"""Commands that make a network and change it: create, run, reconcile, control add, withdraw, tag."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, Scheduler, Workers, check_range, counted, show
+from orchestration.commands.shared import MOST_WORKERS, Aoi, Box, Json, NoReconcile, Scheduler, Workers, check_range, counted, show
 
 if TYPE_CHECKING:
+    from orchestration.reconcile import ReconcileResult
     from submin.storage.catalogue import Catalogue
 
 LARGEST_INNOVATION = 1e-3
@@ -95,14 +96,18 @@ def run(
         float,
         typer.Option("--innovation", help="Reject a block that contradicts the network as only this part of good ones does; 0: none."),
     ] = 1e-6,
+    no_reconcile: NoReconcile = False,
     as_json: Json = False,
 ) -> None:
     """Fuse every block of a catalogue that the network does not have yet. The same command again continues, or says that nothing is left.
+
+    Then every tile gets what lies outside of it, unless --no-reconcile is given.
 
     Example: submin run catalogue network --workers 2
     """
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
+    from orchestration.reconcile import reconcile_changes
     from orchestration.run import run as fuse
     from orchestration.stopping import resumable
     from submin.storage.catalogue import Catalogue
@@ -121,6 +126,7 @@ def run(
         return
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         result = fuse(opened, network, executor, batch_blocks=1 if sequential else batch_blocks, reporter=reporter, innovation=innovation)
+        outside = None if no_reconcile else reconcile_changes(network, executor, reporter)
     lines = [f"{network} {result.version}: {result.fused} blocks fused, {result.skipped} already there, {len(result.rejected)} rejected"]
     if result.control_fused or result.observations_fused:
         lines.append(f"{result.control_fused} control points and {result.observations_fused} clusters of observed positions added")
@@ -140,9 +146,48 @@ def run(
     lines += [f"not used: {c.reason}" for c in result.contradicted]
     lines += [f"rejected block {r.block_id}: {r.reason}" for r in result.rejected]
     lines += [f"tile {t}: the judgement of its rays did not settle; they are used as last judged" for t in result.unsettled_tiles]
-    show(result.to_json(), as_json, "\n".join(lines))
+    _show_change(result.to_json(), outside, as_json, lines, network)
     if result.rejected:
         raise typer.Exit(1)
+
+
+def _show_change(values: dict[str, Any], outside: ReconcileResult | None, as_json: bool, lines: list[str], network: str) -> None:
+    """Show what a change did, and what came to the tiles from outside after it."""
+    if outside is not None:
+        values = values | {"version": outside.version, "reconciled": outside.to_json()}
+        lines = [*lines, _said(outside, network)]
+    show(values, as_json, "\n".join(lines))
+
+
+def _said(outside: ReconcileResult, network: str) -> str:
+    stay = f", {counted(outside.untouched, 'tile')} as before" if outside.untouched else ""
+    return (
+        f"{network} {outside.version}: {counted(outside.tiles, 'tile')} reconciled with what lies outside{stay}; "
+        f"{outside.seconds:.1f} s, {outside.peak_memory_mb:.0f} MB"
+    )
+
+
+@app.command()
+def reconcile(
+    network: Annotated[str, typer.Argument(help="Network to reconcile.")],
+    workers: Workers = 0,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Give every tile what lies outside of it: each alone then answers as the whole network. What changed nothing stays as it is.
+
+    Example: submin reconcile network --workers 2
+    """
+    from orchestration.executors import executor_for
+    from orchestration.progress import progress_bars
+    from orchestration.reconcile import reconcile as exchange
+    from orchestration.stopping import resumable
+
+    check_range("--workers", workers, 0, MOST_WORKERS)
+    with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
+        done = exchange(network, executor, reporter)
+    text = _said(done, network) if done.tiles else f"{network} {done.version}: nothing has changed since it was reconciled"
+    show(done.to_json(), as_json, text)
 
 
 def _run_dense(catalogue: Catalogue, network: str, batch_blocks: int, as_json: bool) -> None:
@@ -175,6 +220,7 @@ def control_add(
     points: Annotated[Path, typer.Argument(help="Table of surveyed points with their covariance or sigmas, or a joint covariance.")],
     workers: Workers = 0,
     scheduler: Scheduler = None,
+    no_reconcile: NoReconcile = False,
     as_json: Json = False,
 ) -> None:
     """Add surveyed control points, known by the ids of tie points or new ones. The same file again does nothing.
@@ -185,6 +231,7 @@ def control_add(
     from orchestration.dense_run import add_dense_control
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
+    from orchestration.reconcile import reconcile_changes
     from orchestration.stopping import resumable
     from submin.storage.dense_reader import is_dense
     from submin.storage.network_store import Snapshot
@@ -195,12 +242,13 @@ def control_add(
     dense = is_dense(snapshot)
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(0 if dense else workers, scheduler) as executor:
         added = add_dense_control(table, network, reporter) if dense else add_control(table, str(points), network, executor, reporter)
+        outside = None if dense or no_reconcile else reconcile_changes(network, executor, reporter)
     lines = [
         f"{network} {added.version}: {added.fused} control points added, {added.skipped} already there, {len(added.rejected)} rejected"
     ]
     lines += [f"rejected {r.point_id}: {r.reason}" for r in added.rejected]
     lines += [f"not used: {c.reason}" for c in added.contradicted]
-    show(added.to_json(), as_json, "\n".join(lines))
+    _show_change(added.to_json(), outside, as_json, lines, network)
     if added.rejected or added.contradicted:
         raise typer.Exit(1)
 
@@ -213,6 +261,7 @@ def withdraw(
     control: Annotated[str | None, typer.Option("--control", help="Id of a control point; correlated ones leave together.")] = None,
     workers: Workers = 0,
     scheduler: Scheduler = None,
+    no_reconcile: NoReconcile = False,
     as_json: Json = False,
 ) -> None:
     """Withdraw a block, an image or a control point, as if it had never been fused. It can come again.
@@ -222,6 +271,7 @@ def withdraw(
     from orchestration.dense_run import withdraw_dense
     from orchestration.executors import executor_for
     from orchestration.progress import progress_bars
+    from orchestration.reconcile import reconcile_changes
     from orchestration.stopping import resumable
     from orchestration.withdraw import withdraw as take
     from submin.storage.dense_reader import is_dense
@@ -234,8 +284,9 @@ def withdraw(
         return
     with resumable(network), progress_bars(quiet=as_json) as reporter, executor_for(workers, scheduler) as executor:
         done = take(network, executor, block=block, image=image, control=control, reporter=reporter)
-    show(done.to_json(), as_json, f"{network} {done.version}: {done.what} withdrawn with {done.rays:,} rays; "
-         f"{len(done.tiles)} tiles judged again")  # fmt: skip
+        outside = None if no_reconcile else reconcile_changes(network, executor, reporter)
+    said = f"{network} {done.version}: {done.what} withdrawn with {done.rays:,} rays; {counted(len(done.tiles), 'tile')} judged again"
+    _show_change(done.to_json(), outside, as_json, [said], network)
 
 
 @app.command()

@@ -23,6 +23,9 @@ Aoi = Annotated[Path | None, typer.Option("--aoi", help="GeoJSON file with the a
 Seed = Annotated[int, typer.Option("--seed", help="Of the random numbers; the same seed gives the same catalogue.")]
 Workers = Annotated[int, typer.Option("--workers", help="Processes of a local Dask cluster; 0 runs without one.")]
 Scheduler = Annotated[str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")]
+NoReconcile = Annotated[
+    bool, typer.Option("--no-reconcile", help="Leave what lies outside of each tile as it was; see 'submin reconcile'.")
+]
 
 
 def show(values: dict[str, Any], as_json: bool, text: str) -> None:

@@ -330,8 +330,8 @@ def prior_and_columns(images: Sequence[ImagePrior], parameters: int) -> tuple[sp
         entries.add(at, columns + np.arange(factor.shape[1]), factor)
         columns += factor.shape[1]
         widths.append((block_id, factor.shape[1]))
-    own = np.array(list(own_column), dtype=np.int64).reshape(-1, 2)
-    return entries.factor((m * p, columns)), WhitenedColumns(own[:, 0], own[:, 1], tuple(shared), tuple(widths))
+    of_image, of_parameter = np.array(list(own_column), dtype=np.int64).reshape(-1, 2).T
+    return entries.factor((m * p, columns)), WhitenedColumns(of_image, of_parameter, tuple(shared), tuple(widths))
 
 
 def prior_variance(prior: sp.csr_array, parameters: int) -> Array:

@@ -202,6 +202,22 @@ def factors(cell: Cell, images: ImageSet, points: NDArray[np.int64]) -> tuple[Li
     return linear, point_factors(linear, weight)
 
 
+def loses(before: Cell, after: Cell) -> bool:
+    """True when a ray that gave information in one state of some points does not in another: of points that both cells hold.
+
+    A point gives information with its second accepted ray.
+    """
+    informative = np.bincount(before.rays.point[before.rays.accepted], minlength=len(before)) >= 2
+    chosen = before.rays.accepted & (informative & np.isin(before.point_ids, after.point_ids))[before.rays.point]
+    if not chosen.any():
+        return False
+    place = np.searchsorted(after.point_ids, before.point_ids[before.rays.point[chosen]])
+    row, width = before.images[before.rays.image[chosen]], 1 + int(max(before.images.max(), after.images.max(initial=0)))
+    kept = after.rays.accepted
+    now = after.rays.point[kept].astype(np.int64) * width + after.images[after.rays.image[kept]]
+    return bool(np.isin(place.astype(np.int64) * width + row, now, invert=True).any())
+
+
 def union_of_images(cells: Sequence[Cell]) -> Index:
     """Rows of the network's images that any of these cells sees, ascending."""
     if not cells:

@@ -103,5 +103,10 @@ def image_set(images: Sequence[NetworkImage], ellipsoid: Ellipsoid, parameters: 
     packed = np.full((len(images), max((len(c) for c in cameras), default=0)), np.nan)
     for row, camera in zip(packed, cameras, strict=True):
         row[: len(camera)] = camera
-    priors = tuple(_prior(i) for i in images)
+    priors = image_priors(images)
     return ImageSet(tuple(i.image_id for i in images), tuple(i.sensor for i in images), packed, priors, parameters, ellipsoid)
+
+
+def image_priors(images: Sequence[NetworkImage]) -> tuple[ImagePrior, ...]:
+    """What is believed a priori of some images; their cameras are not looked at."""
+    return tuple(_prior(image) for image in images)

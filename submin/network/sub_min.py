@@ -42,6 +42,7 @@ class SubMin:
     covariance : (m p, m p) M, both triangles
     chi_square : weighted squares of residuals, a priori model included
     redundancy : degrees of freedom of ``chi_square``
+    whole : True when it is that of the whole network
     """
 
     images: Index
@@ -49,6 +50,7 @@ class SubMin:
     covariance: Array
     chi_square: float
     redundancy: int
+    whole: bool = False
 
 
 def wider(sub_min: SubMin, parameters: int) -> SubMin:

@@ -123,6 +123,9 @@ class _Joined:
         of_tile = self.image_set(rows)
         return factor(add_sums(cells, rows, of_tile.parameters), rows, of_tile)
 
+    def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
+        return None  # what lies outside knows nothing of the block's images
+
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         wanted = np.asarray(rows, dtype=np.int32)
         known, new = self.source.image_set(wanted[wanted < self.rows[0]]), self.block.take(wanted[wanted >= self.rows[0]] - self.rows[0])

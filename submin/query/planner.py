@@ -130,6 +130,9 @@ def cells_near(source: NetworkSource, area: BaseGeometry) -> list[int]:
     if not len(outline):
         return []
     x, y = cover.plane(outline[:, 0], outline[:, 1])
+    opposite = cover.centre[0] + np.array([-180.0, 180.0])
+    if shapely.intersects_xy(area, opposite, -cover.centre[1]).any() or not np.isfinite([x, y]).all():
+        return list(source.cell_numbers())  # in the plane such an area lies outside of its outline
     west, south = x.min() - SEARCH_MARGIN_METRES, y.min() - SEARCH_MARGIN_METRES
     east, north = x.max() + SEARCH_MARGIN_METRES, y.max() + SEARCH_MARGIN_METRES
     near = []
@@ -207,7 +210,7 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
         np.concatenate([np.full(len(s.rows), source.cover.owner(s.cell.number)) for s in kept])[order],
         np.concatenate([ray_counts(s.cell)[s.rows] for s in kept])[order],
         policy, tuple(tiles), state.images,
-        policy in ("tile", "rigorous") and held.issuperset(source.cell_numbers()),
+        state.whole or (policy in ("tile", "rigorous") and held.issuperset(source.cell_numbers())),
     )  # fmt: skip
 
 

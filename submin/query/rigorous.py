@@ -1,6 +1,7 @@
 """Policy ``rigorous``: each cell of the tiles concerned once, and the a priori model of their images once.
 
-For all tiles this is the monolithic network (docs/mathematics.md, "Cells": rigorous merge).
+For all tiles this is the monolithic network (docs/mathematics.md, "Cells": rigorous merge). Where the network is reconciled, what lies
+outside of the tiles comes in too.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from submin.query.source import Index, NetworkSource, existing_cells
 
 
 def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: Sequence[GroundPart]) -> SubMin:
-    """A posteriori state of all images that the tiles see, from their distinct cells, each once."""
+    """A posteriori state of all images that the tiles see, from their distinct cells, each once; of ``images`` from the whole network."""
+    reconciled = source.with_outside(tiles, images)
+    if reconciled is not None:
+        return reconciled
     sums = [source.cell_sums(cell) for cell in existing_cells(source, tiles)]
     rows = np.unique(np.concatenate([of_cell for of_cell, _ in sums])).astype(np.int32)
     image_set = source.image_set(rows)

@@ -38,7 +38,14 @@ class NetworkSource(Protocol):
         ...
 
     def sub_min(self, tile: int, images: Index | None) -> SubMin:
-        """A tile's sub-MIN, or its marginal on some images (ascending)."""
+        """A tile's sub-MIN from its own cells and those that it shares, or its marginal on some images (ascending)."""
+        ...
+
+    def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
+        """State of some images (ascending) from tiles and all that lies outside of them; None where the network cannot tell.
+
+        It cannot before it is reconciled, nor once something is gone that was counted then (docs/mathematics.md, "Outside messages").
+        """
         ...
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:

@@ -1,4 +1,7 @@
-"""Policy ``tile``: the answer of one sub-MIN alone, as the 2008 paper has it (Dolloff et al., section 6)."""
+"""Policy ``tile``: the answer of one sub-MIN alone, as the 2008 paper has it (Dolloff et al., section 6).
+
+Where the network is reconciled, that is with all that lies outside of the tile.
+"""
 
 from __future__ import annotations
 
@@ -19,4 +22,10 @@ def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: 
     """
     if len(tiles) != 1:
         raise QueryError(f"policy 'tile' answers from one tile; {len(tiles)} are asked for: use 'rigorous', 'ci' or 'auto'")
-    return source.sub_min(tiles[0], images)
+    return tile_state(source, tiles[0], images)
+
+
+def tile_state(source: NetworkSource, tile: int, images: Index) -> SubMin:
+    """A posteriori state of some images (ascending) that a tile sees, with what lies outside of the tile where that is known."""
+    reconciled = source.with_outside([tile], images)
+    return source.sub_min(tile, images) if reconciled is None else reconciled

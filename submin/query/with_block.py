@@ -99,6 +99,10 @@ class TileWithBlock:
         rows = (chosen[:, None] * p + np.arange(p)).ravel()
         return replace(state, images=state.images[chosen], theta=state.theta[chosen], covariance=state.covariance[np.ix_(rows, rows)])
 
+    def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
+        """None: a block is joined to what the tile itself holds."""
+        return None
+
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         """Images of these rows (ascending); the block's follow the network's."""
         return _image_set(self.source, self.images, self.first, rows)

@@ -25,6 +25,7 @@ from submin.network.thinning import reported_points
 from submin.query.asked import Asked, few
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import PointsOfTile, cross_covariance, points_of_one_tile
+from submin.query.outside import UnionState, tiles_with_outside
 from submin.query.planner import (
     Answer,
     Selection,
@@ -42,6 +43,7 @@ from submin.storage.compact_table import CompactControl, check_suffix, write_com
 from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
 from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
+from submin.storage.reconciled import ReconciledStore
 from submin.storage.schema import read_sums_of
 from submin.storage.tile_view import TileView
 from submin.storage.validity import Validity, today
@@ -78,6 +80,8 @@ class Network:
         self._numbers: tuple[int, ...] | None = None
         self._tiles: frozenset[int] | None = None
         self._dense = DenseReader(self._snapshot) if is_dense(self._snapshot) else None
+        self._reconciled = ReconciledStore(snapshot, self._earlier)
+        self._unions: dict[tuple[int, ...], UnionState] = {}
 
     @property
     def version(self) -> str:
@@ -370,6 +374,14 @@ class Network:
         if tile not in self._tiles:
             raise QueryError(f"tile {self.cover.tile_name(tile)} holds nothing yet; see 'submin info'")
         return self._snapshot.sub_min(tile, images)
+
+    def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
+        """State of some images from tiles and all that lies outside of them; None where the network cannot tell."""
+        return tiles_with_outside(self, self._reconciled, tiles, images, self._unions) if self._reconciled else None
+
+    def _earlier(self, version: int) -> Network:
+        """The network as it was at a version, with as many parameters an image as now."""
+        return self.at(f"v{version}", self._snapshot.metadata.parameters)
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         """Images of these rows; every image is read once."""

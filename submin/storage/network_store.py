@@ -113,6 +113,9 @@ def create_network(place: str, metadata: NetworkMetadata, begin: Callable[[zarr.
         create_table(root, "directory", DIRECTORY_COLUMNS)
         create_table(root, "flags", FLAG_COLUMNS)
         create_table(root, "changes", CHANGE_COLUMNS)
+        reconciled = root.create_group("reconciled", attributes={"shared_names": []})
+        reconciled.create_group("tiles")
+        reconciled.create_group("trees")
         if begin is not None:
             begin(root)
         session.commit("created", metadata={"version": 0})

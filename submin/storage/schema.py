@@ -41,8 +41,9 @@ JOINT_CHUNK = 256
 FLAG_COLUMNS = {"tile": "int64", "image": "int64"}
 """Which tile finds the camera of which image bad; the prior of an image is released while any tile says so."""
 DIRECTORY_COLUMNS = {"hash": "uint64", "cell": "int64"}
-CHANGE_COLUMNS = {"tile": "int64", "changed": "int64", "lost": "int64"}
-"""Versions in which a tile's own cells last changed, and last lost something that they had counted (decision 014)."""
+CHANGE_COLUMNS = {"tile": "int64", "changed": "int64", "lost": "int64", "stale": "int64"}
+"""Versions in which a tile's own cells last changed, last lost something that they had counted, and in which its own reconciled state
+last came to count something twice (decision 014)."""
 
 
 @dataclass(frozen=True)

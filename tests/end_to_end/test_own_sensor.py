@@ -23,6 +23,7 @@ from submin.storage.catalogue_writer import CatalogueWriter
 
 Array = NDArray[np.float64]
 
+ROOT = Path(__file__).parents[2]
 CENTRE = np.array([[5.4, 43.3, 200.0]])
 POINTS = 40
 SIGMA_PX = 0.3

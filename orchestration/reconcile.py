@@ -1,0 +1,254 @@
+"""Reconcile a network: one pass up and one down a tree of its tiles, after which each tile alone answers as the whole network.
+
+Workers compute and write to forks of the coordinator's session, as in every change; one commit ends it (decision 014).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import icechunk
+import numpy as np
+import scipy.sparse as sp
+import zarr
+from numpy.typing import NDArray
+
+from orchestration.executors import Executor
+from orchestration.progress import Reporter, Silent
+from submin.adjustment.symmetric import between, fill_symmetric
+from submin.errors import InputError
+from submin.network.outside_messages import Message, State, complete, eliminate, front_of
+from submin.network.sub_min import add_sums
+from submin.network.whitened_vectors import Vectors, vectors_of
+from submin.storage.dense_reader import is_dense
+from submin.storage.network_store import Snapshot, begin_change, commit
+from submin.storage.reconciled import (
+    ImageDirectory,
+    ReconciledStore,
+    drop_trees,
+    holders_of_shared,
+    note_shared_names,
+    shared_names,
+    write_elimination,
+    write_tile_state,
+    write_tree,
+)
+from submin.storage.writer_lock import writing
+from submin.tiling.tile_tree import TileTree, TreeNode, trees_of
+
+
+@dataclass(frozen=True)
+class ReconcileResult:
+    """What a reconciliation did; the keys of ``submin reconcile --json``.
+
+    Attributes
+    ----------
+    version : of the network afterwards; tiles : reconciled, untouched : whose states stand as they are
+    parts : connected parts of the network; largest_front : vectors of the largest front
+    """
+
+    version: str
+    tiles: int
+    untouched: int
+    parts: int
+    largest_front: int
+    seconds: float
+    peak_memory_mb: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, as programs rely on them."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True, eq=False)
+class NodeDone:
+    """A node on the way down: the state of its front, and what was written of it."""
+
+    state: State
+    writes: icechunk.ForkSession
+
+
+def reconcile(place: str, executor: Executor, reporter: Reporter | None = None) -> ReconcileResult:
+    """Give every tile of a network what lies outside of it. Parts in which nothing changed since the last time keep their states.
+
+    Raises
+    ------
+    InputError
+        When the network is dense: it has one tile, and nothing outside.
+    BusyError, ConflictError
+        When another process is writing to the network; nothing is written then.
+    """
+    started, reporter = time.monotonic(), reporter or Silent()
+    with writing(place):
+        session, base = begin_change(place, Snapshot.open(place).number)
+        if is_dense(base):
+            raise InputError(f"{place}: is a dense network, whose one tile holds every point; there is nothing to reconcile")
+        known, names, vectors = _vectors(base, executor, reporter)
+        trees = trees_of(tuple(vectors), [of_tile.names for of_tile in vectors.values()], _middles(base, vectors))
+        kept = {tree.tiles: name for tree in trees if (name := _standing(known, tree, vectors)) is not None}
+        new = [tree for tree in trees if tree.tiles not in kept]
+        front = max((len(node.interior) + len(node.boundary) for tree in new for node in tree.nodes), default=0)
+        untouched = sum(len(tiles) for tiles in kept)
+        version = base.number
+        if new or set(kept.values()) != set(known.trees()):
+            version += 1
+            made = {}
+            for k, tree in enumerate(new):
+                made[f"v{version}p{k}"] = tree, *_reconcile_tree(session, base, f"v{version}p{k}", tree, vectors, executor, reporter)
+            for _, _, writes in made.values():
+                session.merge(*writes)
+            root = zarr.open_group(session.store, mode="r+")
+            note_shared_names(root, names)
+            for name, (tree, whole, _) in made.items():
+                attributes = {
+                    "version": version, "images": base.image_count(), "released": sorted({row for _, row in base.flags()}),
+                    "chi_square": whole.chi_square, "redundancy": whole.redundancy,
+                }  # fmt: skip
+                write_tree(root, name, tree, holders_of_shared(tree.tiles, [vectors[tile] for tile in tree.tiles]), attributes)
+            drop_trees(root, {*kept.values(), *made}, [base.cover.tile_name(tile) for tile in vectors])
+            root.attrs["version"] = version
+            commit(session, version, f"{len(vectors) - untouched} tiles reconciled")
+    return ReconcileResult(
+        f"v{version}", len(vectors) - untouched, untouched, len(trees), front, time.monotonic() - started, executor.peak_memory_mb()
+    )
+
+
+def reconcile_changes(place: str, executor: Executor, reporter: Reporter | None = None) -> ReconcileResult | None:
+    """Reconcile a network after a change; None where nothing lies outside of a tile, or nothing has changed."""
+    latest = Snapshot.open(place)
+    if len(latest.tile_numbers()) < 2:
+        return None
+    known = ReconciledStore.of(latest)
+    trees = known.trees().values()
+    if trees and all(tree.version >= max(known.changed.values(), default=0) for tree in trees):
+        return None
+    done = reconcile(place, executor, reporter)
+    return done if done.version != latest.version else None
+
+
+def _vectors(base: Snapshot, executor: Executor, reporter: Reporter) -> tuple[ReconciledStore, tuple[str, ...], dict[int, Vectors]]:
+    """What is kept so far, names of the parameters that passes share, and the vectors of every tile."""
+    directory, tiles = ImageDirectory(base), base.tile_numbers()
+    held = {tile: base.tile_images(tile) for tile in tiles}
+    wholes = {tile: directory.whole(images) for tile, images in held.items()}
+    names = shared_names(base, wholes.values())
+    arguments = [(wholes[tile], held[tile], base.metadata.parameters, names) for tile in tiles]
+    handles = executor.submit_all(vectors_of, arguments, "vectors", reporter.stage("naming vectors", len(tiles)))
+    return ReconciledStore.of(base), names, dict(zip(tiles, executor.results(handles), strict=True))
+
+
+def _middles(base: Snapshot, tiles: Iterable[int]) -> NDArray[np.float64]:
+    outlines = np.array([base.cover.core_outline(tile) for tile in tiles]).reshape(-1, 5, 2)
+    return np.asarray(0.5 * (outlines[:, 0] + outlines[:, 2]))
+
+
+def _standing(known: ReconciledStore, tree: TileTree, vectors: Mapping[int, Vectors]) -> str | None:
+    """Name under which a part of the network is kept as it still is, or None."""
+    states = [known.tile(tile) for tile in tree.tiles]
+    names = {state.tree for state in states if state is not None}
+    if len(names) != 1 or None in states:
+        return None
+    (name,) = names
+    before = known.tree(name)
+    same = before.tiles == set(tree.tiles) and all(
+        state is not None and np.array_equal(state.vectors.names, vectors[tile].names)
+        for tile, state in zip(tree.tiles, states, strict=True)
+    )
+    changed = any(known.changed.get(tile, 0) > before.version for tile in tree.tiles)
+    released = {row for row in known.released if row < before.images} != set(before.released)
+    return name if same and not changed and not released else None
+
+
+def _reconcile_tree(
+    session: icechunk.Session, base: Snapshot, name: str, tree: TileTree, vectors: Mapping[int, Vectors], executor: Executor,
+    reporter: Reporter,
+) -> tuple[Message, list[icechunk.ForkSession]]:  # fmt: skip
+    """Messages up and states down one tree: what its root says of the whole part, and what was written."""
+    shared = executor.share(Snapshot(base.root, base.place, replace(base.cover, area=b"")))
+    nodes, levels = tree.nodes, tree.levels()
+    of_tile = [k for k, node in enumerate(nodes) if node.tile >= 0]
+    messages: list[Any] = [None] * len(nodes)
+    advance = reporter.stage("collecting from tiles", len(nodes))
+
+    def run(function: Callable[..., Any], places: Sequence[int], arguments: Sequence[tuple[Any, ...]], task: str, into: list[Any]) -> None:
+        for k, handle in zip(places, executor.submit_all(function, arguments, task, advance), strict=True):
+            into[k] = handle
+
+    run(collect_tile, of_tile, [(shared, nodes[k], vectors[nodes[k].tile]) for k in of_tile], "collect-tile", messages)
+    for level in levels:
+        run(collect_node, level, [(nodes[k], [messages[c] for c in nodes[k].children]) for k in level], "collect-node", messages)
+
+    states: list[Any] = [None] * len(nodes)
+    writes: list[icechunk.ForkSession] = []
+    parents, advance = tree.parents(), reporter.stage("distributing to tiles", len(nodes))
+
+    def above(k: int) -> Any:
+        return states[parents[k]] if parents[k] >= 0 else None
+
+    def keep_writes(places: Sequence[int]) -> None:
+        quiet = reporter.stage("distributing to tiles", 0)
+        writes.extend(executor.results(executor.submit_all(writes_of, [(states[k],) for k in places], "writes-of", quiet)))
+
+    (whole,) = executor.results([messages[-1]])
+    for level in reversed(levels):
+        arguments = [(session.fork(), name, k, nodes[k], [messages[c] for c in nodes[k].children], above(k)) for k in level]
+        run(distribute_node, level, arguments, "distribute-node", states)
+        keep_writes(level)
+    tiles = [(session.fork(), shared, name, k, nodes[k], vectors[nodes[k].tile], above(k)) for k in of_tile]
+    finished: list[Any] = [None] * len(nodes)
+    run(distribute_tile, of_tile, tiles, "distribute-tile", finished)
+    return whole, [*writes, *executor.results([finished[k] for k in of_tile])]
+
+
+def collect_tile(base: Snapshot, node: TreeNode, vectors: Vectors) -> Message:
+    """What the own cells of a tile say of the vectors that other tiles hold too."""
+    return eliminate(node.interior, node.boundary, *_own_front(base, node, vectors))[1]
+
+
+def collect_node(node: TreeNode, messages: Sequence[Message]) -> Message:
+    """What the tiles below a node say of the vectors that tiles outside hold too."""
+    return eliminate(node.interior, node.boundary, *_sum_of(node, messages))[1]
+
+
+def distribute_node(
+    writes: icechunk.ForkSession, tree: str, place: int, node: TreeNode, messages: Sequence[Message], above: NodeDone | None
+) -> NodeDone:
+    """The posterior state of a node's front, from that of the node above; its elimination is kept, for queries over several tiles."""
+    done, _ = eliminate(node.interior, node.boundary, *_sum_of(node, messages))
+    write_elimination(zarr.open_group(writes.store, mode="r+"), tree, place, done)
+    return NodeDone(complete(done, None if above is None else above.state), writes)
+
+
+def writes_of(done: NodeDone) -> icechunk.ForkSession:
+    """The part of a node's result that goes back to the coordinator; the state stays with the workers."""
+    return done.writes
+
+
+def distribute_tile(
+    writes: icechunk.ForkSession, base: Snapshot, tree: str, place: int, node: TreeNode, vectors: Vectors, above: NodeDone | None
+) -> icechunk.ForkSession:
+    """The posterior state of a tile's vectors, written."""
+    done, _ = eliminate(node.interior, node.boundary, *_own_front(base, node, vectors))
+    root = zarr.open_group(writes.store, mode="r+")
+    write_elimination(root, tree, place, done)
+    state = complete(done, None if above is None else above.state)
+    write_tile_state(root, base.cover.tile_name(node.tile), tree, place, vectors, state)
+    return writes
+
+
+def _own_front(base: Snapshot, node: TreeNode, vectors: Vectors) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
+    """Information of a tile's own cells about its vectors, interior ones first, and its scalars."""
+    cells = [base.cell(number) for number in base.cover.cells_owned(node.tile)]
+    sums = add_sums([(cell.images, cell.sums) for cell in cells if len(cell.images)], vectors.images, base.metadata.parameters)
+    order = np.searchsorted(vectors.names, np.concatenate([node.interior, node.boundary]))
+    prior = sp.csr_array(vectors.prior[:, order])
+    information = between(prior, fill_symmetric(sums.information), transposed=True)
+    return information, prior.T @ sums.vector, sums.misclosure, sums.redundancy
+
+
+def _sum_of(node: TreeNode, messages: Sequence[Message]) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
+    front = front_of(np.concatenate([node.interior, node.boundary]), messages)
+    return *front, sum(message.chi_square for message in messages), sum(message.redundancy for message in messages)
