@@ -241,8 +241,8 @@ def distribute_tile(
 
 def _own_front(base: Snapshot, node: TreeNode, vectors: Vectors) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
     """Information of a tile's own cells about its vectors, interior ones first, and its scalars."""
-    cells = [base.cell(number) for number in base.cover.cells_owned(node.tile)]
-    sums = add_sums([(cell.images, cell.sums) for cell in cells if len(cell.images)], vectors.images, base.metadata.parameters)
+    cells = [base.cell_sums(number) for number in base.cover.cells_owned(node.tile)]
+    sums = add_sums([cell for cell in cells if len(cell[0])], vectors.images, base.metadata.parameters)
     order = np.searchsorted(vectors.names, np.concatenate([node.interior, node.boundary]))
     prior = sp.csr_array(vectors.prior[:, order])
     information = between(prior, fill_symmetric(sums.information), transposed=True)

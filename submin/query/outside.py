@@ -234,34 +234,33 @@ def joint(kept: Reconciled, parts: Sequence[Functionals]) -> tuple[Array, Array]
     """
     ends = np.cumsum([0, *(part.weights.shape[0] for part in parts)])
     mean, covariance = np.empty(ends[-1]), np.zeros((ends[-1], ends[-1]))
-    ways: list[tuple[str, dict[int, Array]]] = []
+    passing: dict[tuple[str, int], list[tuple[int, Array]]] = {}
+    for k, part in enumerate(parts if len(parts) > 1 else ()):
+        for node, noise in _way_up(kept, part).items():
+            passing.setdefault(node, []).append((k, noise))
+    for ways in passing.values():
+        if len(ways) > 1:  # what only one passes is in its own block
+            rows = np.concatenate([np.arange(ends[k], ends[k + 1]) for k, _ in ways])
+            noise = np.concatenate([noise for _, noise in ways])
+            covariance[np.ix_(rows, rows)] += noise @ noise.T
     for k, part in enumerate(parts):
         own, state = slice(ends[k], ends[k + 1]), kept.tile(part.tile)
         assert state is not None
         mean[own] = part.weights @ state.mean[part.columns]
         covariance[own, own] = between(part.weights, kept.covariance(part.tile, part.columns))
-        if len(parts) == 1:
-            break
-        ways.append((state.tree, _way_up(kept, state, part)))
-        for other in range(k):
-            if ways[other][0] == state.tree:
-                beside = slice(ends[other], ends[other + 1])
-                common = ways[other][1].keys() & ways[k][1].keys()
-                covariance[own, beside] = sum(
-                    (ways[k][1][node] @ ways[other][1][node].T for node in common),
-                    np.zeros((ends[k + 1] - ends[k], beside.stop - beside.start)),
-                )
-    return mean, fill_symmetric(covariance)
+    return mean, covariance
 
 
-def _way_up(kept: Reconciled, state: TileState, part: Functionals) -> dict[int, Array]:
-    """Noise (n, k) of combinations of a tile's vectors at every node from the tile to the root."""
+def _way_up(kept: Reconciled, part: Functionals) -> dict[tuple[str, int], Array]:
+    """Noise (n, k) of combinations of a tile's vectors at every node of its tree from the tile to the root."""
+    state = kept.tile(part.tile)
+    assert state is not None
     names, weights = state.vectors.names, np.zeros((part.weights.shape[0], len(state.vectors.names)))
     weights[:, part.columns] = part.weights.toarray()
     parents, node, noise = kept.tree(state.tree).parents, state.node, {}
     while node >= 0:
         done = kept.elimination(state.tree, node)
-        noise[node], weights = carried(done, names, weights)
+        noise[state.tree, node], weights = carried(done, names, weights)
         names, node = done.boundary, parents[node]
     return noise
 

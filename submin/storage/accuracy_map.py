@@ -12,6 +12,7 @@ from submin import accuracy
 from submin.geodesy import geocentric_to_geodetic, local_axes, rotate_covariance
 from submin.network.sub_min import GroundPart, loadings, locate, point_covariances
 from submin.query.planner import Selection, ground_part, ray_counts
+from submin.query.tile import tile_state
 from submin.storage.network import Network
 from submin.storage.schema import determined
 from submin.storage.validity import today
@@ -82,7 +83,7 @@ def _of_tile(network: Network, tile: int, day: date) -> PointAccuracy:
     if not parts:
         return _joined([])
     images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
-    state = network.sub_min(tile, images)
+    state = tile_state(network, tile, images)
     geodetic = geocentric_to_geodetic(np.concatenate([locate(part, state) for part in parts]), network.cover.ellipsoid)
     own = np.concatenate([part.factors.own for part in parts])
     covariance = point_covariances(loadings(parts, state.images, state.theta.shape[1]), own, state.covariance)

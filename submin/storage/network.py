@@ -18,7 +18,7 @@ from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
-from submin.network.cell import Cell, widened_sums
+from submin.network.cell import Cell
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.sub_min import SubMin
 from submin.network.thinning import reported_points
@@ -37,14 +37,12 @@ from submin.query.planner import (
     well_spread,
 )
 from submin.query.point_metadata import PointMetadata, metadata_of_points
-from submin.storage.arrays import group_of, read_record
 from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
 from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.reconciled import ReconciledStore
-from submin.storage.schema import read_sums_of
 from submin.storage.tile_view import TileView
 from submin.storage.validity import Validity, today
 from submin.tiling.cover import Cover
@@ -362,10 +360,7 @@ class Network:
 
     def cell_sums(self, number: int) -> tuple[Index, Sums]:
         """A cell's images and sums."""
-        group = group_of(self._snapshot.root, "cells/" + self.cover.cell_name(number))
-        parts = read_record(group, ["images", "vector", "information"])
-        images = parts["images"].astype(np.int32)
-        return images, widened_sums(read_sums_of(group, parts), len(images), self._snapshot.metadata.parameters)
+        return self._snapshot.cell_sums(number)
 
     def sub_min(self, tile: int, images: Index | None) -> SubMin:
         """A tile's sub-MIN, or its marginal on some images."""

@@ -18,9 +18,11 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from submin.adjustment.elimination import Sums
+from submin.adjustment.priors import ImagePrior
 from submin.errors import ConflictError, QueryError, StoreError
-from submin.network.cell import Cell, empty_cell
-from submin.network.network_image import NetworkImage
+from submin.network.cell import Cell, empty_cell, empty_sums, widened_sums
+from submin.network.network_image import NetworkImage, image_priors
 from submin.network.sub_min import SubMin
 from submin.storage.arrays import attributes_of, create_table, group_of, hash_ids, read_record, read_table, table_length
 from submin.storage.schema import (
@@ -33,6 +35,7 @@ from submin.storage.schema import (
     network_images,
     read_cell,
     read_sub_min,
+    read_sums_of,
     with_joint,
 )
 from submin.tiling.cover import Cover
@@ -228,6 +231,16 @@ class Snapshot:
             return empty_cell(number, self.metadata.parameters)
         return read_cell(group_of(self.root, name), self.metadata.parameters, with_sums=with_sums)
 
+    def cell_sums(self, number: int) -> tuple[NDArray[np.int32], Sums]:
+        """A cell's images and sums, without its points and rays; nothing of a cell that has no points."""
+        name = "cells/" + self.cover.cell_name(number)
+        if name not in self.root:
+            return np.empty(0, dtype=np.int32), empty_sums(0, self.metadata.parameters)
+        group = group_of(self.root, name)
+        parts = read_record(group, ["images", "vector", "information"])
+        images = parts["images"].astype(np.int32)
+        return images, widened_sums(read_sums_of(group, parts), len(images), self.metadata.parameters)
+
     def cell_numbers(self) -> tuple[int, ...]:
         """Cells that hold points or rays, ascending."""
         return tuple(sorted(self.cover.cell_number(name) for name in group_of(self.root, "cells").group_keys()))
@@ -269,6 +282,12 @@ class Snapshot:
             span = network_images(read_table(table, wanted, int(run[0]), int(run[-1]) + 1))
             found.extend(span[int(row) - int(run[0])] for row in run)
         return with_joint(self.root, found)
+
+    def image_priors(self) -> tuple[ImagePrior, ...]:
+        """What is believed a priori of every image, by row; cameras are not read."""
+        columns = self.image_columns(["image_id", "block_id", "pass_id", "sensor", "width", "height", "seconds", "a_priori", "released"])
+        columns["camera"] = np.full(len(columns["image_id"]), "")
+        return image_priors(with_joint(self.root, network_images(columns)))
 
     def image_columns(self, wanted: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Columns of the image table."""

@@ -17,7 +17,6 @@ import scipy.sparse as sp
 import zarr
 from numpy.typing import NDArray
 
-from submin.network.network_image import image_priors
 from submin.network.outside_messages import Elimination, State, unpacked_state
 from submin.network.whitened_vectors import PASS, Vectors, WholeImages, vectors_of
 from submin.query.outside import TileState, TreeState
@@ -45,20 +44,17 @@ class ImageDirectory:
 
     def __init__(self, snapshot: Snapshot) -> None:
         table = snapshot.image_columns(["block_id", "pass_id", "withdrawn"])
-        self.snapshot = snapshot
+        self._priors = snapshot.image_priors()
         self.present = table["withdrawn"] == 0
         self._block, self.block_row = _first_of(table["block_id"])
         _, self.pass_row = _first_of(table["pass_id"])
 
     def whole(self, held: Index) -> WholeImages:
         """Some images (rows, ascending) with those of their blocks, or sets, that their errors are correlated with."""
-        priors = image_priors(self.snapshot.images(held))
-        blocks = np.unique([self._block[row] for row, prior in zip(held, priors, strict=True) if prior.correlated])
+        blocks = np.unique([self._block[row] for row in held.tolist() if self._priors[row].correlated])
         mates = np.flatnonzero(np.isin(self._block, blocks) & self.present) if len(blocks) else held[:0]
         rows = np.union1d(held, mates).astype(np.int32)
-        if len(rows) > len(held):
-            priors = image_priors(self.snapshot.images(rows))
-        return WholeImages(rows, priors, self.pass_row[rows], self.block_row[rows])
+        return WholeImages(rows, tuple(self._priors[row] for row in rows.tolist()), self.pass_row[rows], self.block_row[rows])
 
 
 def _first_of(names: NDArray[np.str_]) -> tuple[Names, Names]:
