@@ -23,6 +23,7 @@ from submin.errors import InputError
 from submin.network.outside_messages import Message, State, complete, eliminate, front_of
 from submin.network.sub_min import add_sums
 from submin.network.whitened_vectors import Vectors, vectors_of
+from submin.query.outside import other_priors
 from submin.storage.dense_reader import is_dense
 from submin.storage.network_store import Snapshot, begin_change, commit
 from submin.storage.reconciled import (
@@ -103,11 +104,13 @@ def reconcile(place: str, executor: Executor, reporter: Reporter | None = None) 
             root = zarr.open_group(session.store, mode="r+")
             note_shared_names(root, names)
             for name, (tree, whole, _) in made.items():
+                of_tiles = [vectors[tile] for tile in tree.tiles]
+                members = np.unique(np.concatenate([v.images for v in of_tiles])).astype(np.int64)
                 attributes = {
-                    "version": version, "images": base.image_count(), "released": sorted({row for _, row in base.flags()}),
+                    "version": version, "images": base.image_count(), "released": sorted(known.released.intersection(members.tolist())),
                     "chi_square": whole.chi_square, "redundancy": whole.redundancy,
                 }  # fmt: skip
-                write_tree(root, name, tree, holders_of_shared(tree.tiles, [vectors[tile] for tile in tree.tiles]), attributes)
+                write_tree(root, name, tree, members, holders_of_shared(tree.tiles, of_tiles), attributes)
             drop_trees(root, {*kept.values(), *made}, [base.cover.tile_name(tile) for tile in vectors])
             root.attrs["version"] = version
             commit(session, version, f"{len(vectors) - untouched} tiles reconciled")
@@ -158,8 +161,7 @@ def _standing(known: ReconciledStore, tree: TileTree, vectors: Mapping[int, Vect
         for tile, state in zip(tree.tiles, states, strict=True)
     )
     changed = any(known.changed.get(tile, 0) > before.version for tile in tree.tiles)
-    released = {row for row in known.released if row < before.images} != set(before.released)
-    return name if same and not changed and not released else None
+    return name if same and not changed and not other_priors(before, known.released) else None
 
 
 def _reconcile_tree(

@@ -50,7 +50,8 @@ class TreeState:
 
     Attributes
     ----------
-    version : of the states; images : number of images that the network had then; released : rows of those whose prior was released
+    version : of the states; images : number of images that the network had then
+    members : rows of the images that the part sees, ascending; released : those of them whose prior was released
     tiles : of the part; parents : place of each node's parent, -1 for the root
     shared : names of vectors of passes and sets, ascending; holder : a tile that holds each
     chi_square, redundancy : of the whole part
@@ -58,6 +59,7 @@ class TreeState:
 
     version: int
     images: int
+    members: NDArray[np.int64]
     released: frozenset[int]
     tiles: frozenset[int]
     parents: tuple[int, ...]
@@ -180,9 +182,13 @@ def _rows_of(images: NDArray[np.integer], parameters: int) -> NDArray[np.int64]:
 
 def _stale(tree: TreeState, kept: Reconciled, tiles: Sequence[int]) -> bool:
     """True when the states of a part count something that is no more, outside of some tiles."""
-    if {row for row in kept.released if row < tree.images} != set(tree.released):
-        return True
-    return kept.gone(tiles) > tree.version
+    return other_priors(tree, kept.released) or kept.gone(tiles) > tree.version
+
+
+def other_priors(tree: TreeState, released: frozenset[int]) -> bool:
+    """True when the prior of an image of a part has been released since, or is in use again."""
+    now = np.array(sorted(released), dtype=np.int64)
+    return set(now[np.isin(now, tree.members)].tolist()) != tree.released
 
 
 def _changed_owners(source: NetworkSource, kept: Reconciled, tile: int, version: int) -> bool:

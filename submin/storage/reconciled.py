@@ -76,12 +76,15 @@ def note_shared_names(root: zarr.Group, names: Sequence[str]) -> None:
     group_of(root, "reconciled").attrs["shared_names"] = list(names)
 
 
-def write_tree(root: zarr.Group, name: str, tree: TileTree, holder: Mapping[int, int], attributes: Mapping[str, Any]) -> None:
-    """Write a connected part of the network; ``holder`` names a tile for each vector of a pass or set."""
+def write_tree(
+    root: zarr.Group, name: str, tree: TileTree, members: Names, holder: Mapping[int, int], attributes: Mapping[str, Any]
+) -> None:  # fmt: skip
+    """Write a connected part of the network, which sees the images ``members``; ``holder``: a tile for each vector of a pass or set."""
     shared = np.array(sorted(holder), dtype=np.int64)
     write_record(
         group_of(root, TREES), name,
-        {"parents": np.array(tree.parents(), dtype=np.int64), "tiles": np.array(tree.tiles, dtype=np.int64), "shared": shared,
+        {"parents": np.array(tree.parents(), dtype=np.int64), "tiles": np.array(tree.tiles, dtype=np.int64),
+         "members": members, "shared": shared,
          "holder": np.array([holder[key] for key in shared.tolist()], dtype=np.int64)},
         attributes,
     )  # fmt: skip
@@ -149,7 +152,7 @@ def read_tree(root: zarr.Group, name: str) -> TreeState:
     group = group_of(root, f"{TREES}/{name}")
     parts, a = read_record(group), attributes_of(group)
     return TreeState(
-        int(a["version"]), int(a["images"]), frozenset(a["released"]), frozenset(parts["tiles"].tolist()),
+        int(a["version"]), int(a["images"]), parts["members"], frozenset(a["released"]), frozenset(parts["tiles"].tolist()),
         tuple(parts["parents"].tolist()), parts["shared"], parts["holder"], float(a["chi_square"]), int(a["redundancy"]),
     )  # fmt: skip
 
