@@ -244,9 +244,8 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
         session.merge(*(report.writes for report in reports), *(done.writes for done in factored))
     gone = [f"cells/{move.cover.cell_name(c)}" for report in reports for c, cell in report.cells.items() if not len(cell.images)]
     gone += [f"cells/{name}" for name in sorted(move.out.dissolved)]
-    gone += [f"tiles/{move.cover.tile_name(t.tile)}" for t in factored if not t.images]
-    for tile in split - {*base.cover.splits}:
-        gone += [f"{group}/{base.cover.tile_name(tile)}" for group in ("tiles", TILE_STATES)]
+    no_more = {done.tile for done in factored if not done.images} | (split - {*base.cover.splits})
+    gone += [f"{group}/{base.cover.tile_name(tile)}" for tile in sorted(no_more) for group in ("tiles", TILE_STATES)]
     rejected = _rejected_rays((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
     return Settled(tuple(reports), _changes(base, move, reports, origins), frozenset(flags), tuple(gone), rejected)
 

@@ -20,7 +20,7 @@ from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from submin.adjustment.symmetric import between, fill_symmetric
 from submin.errors import InputError
-from submin.network.outside_messages import Message, State, complete, eliminate, front_of
+from submin.network.outside_messages import Elimination, Message, State, complete, eliminate, front_of
 from submin.network.sub_min import add_sums
 from submin.network.whitened_vectors import Vectors, vectors_of
 from submin.query.outside import other_priors
@@ -87,8 +87,8 @@ def reconcile(place: str, executor: Executor, reporter: Reporter | None = None) 
         session, base = begin_change(place, Snapshot.open(place).number)
         if is_dense(base):
             raise InputError(f"{place}: is a dense network, whose one tile holds every point; there is nothing to reconcile")
-        known, names, vectors = _vectors(base, executor, reporter)
-        trees = trees_of(tuple(vectors), [of_tile.names for of_tile in vectors.values()], _middles(base, vectors))
+        known, names = ReconciledStore.of(base), shared_names(base)
+        vectors, trees = plan_trees(base, executor, reporter)
         kept = {tree.tiles: name for tree in trees if (name := _standing(known, tree, vectors)) is not None}
         new = [tree for tree in trees if tree.tiles not in kept]
         front = max((len(node.interior) + len(node.boundary) for tree in new for node in tree.nodes), default=0)
@@ -132,15 +132,14 @@ def reconcile_changes(place: str, executor: Executor, reporter: Reporter | None 
     return done if done.version != latest.version else None
 
 
-def _vectors(base: Snapshot, executor: Executor, reporter: Reporter) -> tuple[ReconciledStore, tuple[str, ...], dict[int, Vectors]]:
-    """What is kept so far, names of the parameters that passes share, and the vectors of every tile."""
-    directory, tiles = ImageDirectory(base), base.tile_numbers()
-    held = {tile: base.tile_images(tile) for tile in tiles}
-    wholes = {tile: directory.whole(images) for tile, images in held.items()}
-    names = shared_names(base, wholes.values())
-    arguments = [(wholes[tile], held[tile], base.metadata.parameters, names) for tile in tiles]
-    handles = executor.submit_all(vectors_of, arguments, "vectors", reporter.stage("naming vectors", len(tiles)))
-    return ReconciledStore.of(base), names, dict(zip(tiles, executor.results(handles), strict=True))
+def plan_trees(base: Snapshot, executor: Executor, reporter: Reporter) -> tuple[dict[int, Vectors], tuple[TileTree, ...]]:
+    """The vectors of every tile, and a tree for each connected part of the network."""
+    directory, names = ImageDirectory(base), shared_names(base)
+    held = {tile: base.tile_images(tile) for tile in base.tile_numbers()}
+    arguments = [(directory.whole(images), images, base.metadata.parameters, names) for images in held.values()]
+    handles = executor.submit_all(vectors_of, arguments, "vectors", reporter.stage("naming vectors", len(held)))
+    vectors = dict(zip(held, executor.results(handles), strict=True))
+    return vectors, trees_of(tuple(vectors), [of_tile.names for of_tile in vectors.values()], _middles(base, vectors))
 
 
 def _middles(base: Snapshot, tiles: Iterable[int]) -> NDArray[np.float64]:
@@ -207,19 +206,19 @@ def _reconcile_tree(
 
 def collect_tile(base: Snapshot, node: TreeNode, vectors: Vectors) -> Message:
     """What the own cells of a tile say of the vectors that other tiles hold too."""
-    return eliminate(node.interior, node.boundary, *_own_front(base, node, vectors))[1]
+    return eliminate_tile(base, node, vectors)[1]
 
 
 def collect_node(node: TreeNode, messages: Sequence[Message]) -> Message:
     """What the tiles below a node say of the vectors that tiles outside hold too."""
-    return eliminate(node.interior, node.boundary, *_sum_of(node, messages))[1]
+    return eliminate_node(node, messages)[1]
 
 
 def distribute_node(
     writes: icechunk.ForkSession, tree: str, place: int, node: TreeNode, messages: Sequence[Message], above: NodeDone | None
 ) -> NodeDone:
     """The posterior state of a node's front, from that of the node above; its elimination is kept, for queries over several tiles."""
-    done, _ = eliminate(node.interior, node.boundary, *_sum_of(node, messages))
+    done, _ = eliminate_node(node, messages)
     write_elimination(zarr.open_group(writes.store, mode="r+"), tree, place, done)
     return NodeDone(complete(done, None if above is None else above.state), writes)
 
@@ -233,7 +232,7 @@ def distribute_tile(
     writes: icechunk.ForkSession, base: Snapshot, tree: str, place: int, node: TreeNode, vectors: Vectors, above: NodeDone | None
 ) -> icechunk.ForkSession:
     """The posterior state of a tile's vectors, written."""
-    done, _ = eliminate(node.interior, node.boundary, *_own_front(base, node, vectors))
+    done, _ = eliminate_tile(base, node, vectors)
     root = zarr.open_group(writes.store, mode="r+")
     write_elimination(root, tree, place, done)
     state = complete(done, None if above is None else above.state)
@@ -241,16 +240,18 @@ def distribute_tile(
     return writes
 
 
-def _own_front(base: Snapshot, node: TreeNode, vectors: Vectors) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
-    """Information of a tile's own cells about its vectors, interior ones first, and its scalars."""
+def eliminate_tile(base: Snapshot, node: TreeNode, vectors: Vectors) -> tuple[Elimination, Message]:
+    """Eliminate, from a tile's own cells, the vectors that no other tile holds."""
     cells = [base.cell_sums(number) for number in base.cover.cells_owned(node.tile)]
     sums = add_sums([cell for cell in cells if len(cell[0])], vectors.images, base.metadata.parameters)
     order = np.searchsorted(vectors.names, np.concatenate([node.interior, node.boundary]))
     prior = sp.csr_array(vectors.prior[:, order])
     information = between(prior, fill_symmetric(sums.information), transposed=True)
-    return information, prior.T @ sums.vector, sums.misclosure, sums.redundancy
+    return eliminate(node.interior, node.boundary, information, prior.T @ sums.vector, sums.misclosure, sums.redundancy)
 
 
-def _sum_of(node: TreeNode, messages: Sequence[Message]) -> tuple[NDArray[np.float64], NDArray[np.float64], float, int]:
+def eliminate_node(node: TreeNode, messages: Sequence[Message]) -> tuple[Elimination, Message]:
+    """Eliminate, from what the tiles below a node say, the vectors that no tile outside holds."""
     front = front_of(np.concatenate([node.interior, node.boundary]), messages)
-    return *front, sum(message.chi_square for message in messages), sum(message.redundancy for message in messages)
+    chi_square, redundancy = sum(message.chi_square for message in messages), sum(message.redundancy for message in messages)
+    return eliminate(node.interior, node.boundary, *front, chi_square, redundancy)

@@ -11,6 +11,7 @@ import numpy as np
 
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
+from orchestration.verify_reconciled import verify_reconciled
 from submin.errors import StoreError, SubminError
 from submin.network.variance_factor import VarianceFactor, pooled
 from submin.storage.network_store import Snapshot
@@ -111,6 +112,7 @@ def _factored(snapshot: Snapshot, executor: Executor, reporter: Reporter) -> tup
     found: list[TileHealth] = executor.results(handles)
     problems += [problem for tile in found for problem in tile.problems]
     problems += verify_network(snapshot, [cell for tile in found for cell in tile.cells], not any(tile.unread for tile in found))
+    problems += verify_reconciled(snapshot, executor, reporter)
     return problems, found
 
 

@@ -28,6 +28,7 @@ KINDS = {
     "not-positive-definite": "an information matrix or a covariance is not positive definite",
     "not-symmetric": "the two triangles of a covariance differ",
     "round-off": "a sub-MIN differs from its replay by more than round-off may",
+    "stale-state": "what was reconciled is not what follows from the cells of its version",
     "lost-cell": "a sub-MIN counts a cell that is not there",
     "lost-tile": "cells are there that a tile holds, and the tile has no sub-MIN",
     "directory": "the directory of points says another cell than the one in which a point is",

@@ -63,10 +63,10 @@ def _first_of(names: NDArray[np.str_]) -> tuple[Names, Names]:
     return number.astype(np.int64), first[number].astype(np.int64)
 
 
-def shared_names(snapshot: Snapshot, whole: Iterable[WholeImages]) -> tuple[str, ...]:
+def shared_names(snapshot: Snapshot) -> tuple[str, ...]:
     """Names of the parameters that passes share, those that earlier versions knew first."""
     known: list[str] = list(attributes_of(group_of(snapshot.root, "reconciled"))["shared_names"])
-    kinds = {(prior.a_priori, prior.parameters) for images in whole for prior in images.priors if prior.a_priori is not None}
+    kinds = {(prior.a_priori, prior.parameters) for prior in snapshot.image_priors() if prior.a_priori is not None}
     names = {p.name for model, parameters in kinds for p in parameters if (u := model.of(p)).sigma > 0.0 and u.common_to_pass > 0.0}
     return (*known, *sorted(names - set(known)))
 
@@ -270,7 +270,7 @@ class ReconciledStore:
     def vectors(self, images: Index) -> Vectors:
         """The whitened vectors of images of the present version."""
         whole = ImageDirectory(self._snapshot).whole(images)
-        return vectors_of(whole, images, self._snapshot.metadata.parameters, shared_names(self._snapshot, [whole]))
+        return vectors_of(whole, images, self._snapshot.metadata.parameters, shared_names(self._snapshot))
 
     def trees(self) -> dict[str, TreeState]:
         """All parts of the network that have been reconciled and that tiles refer to."""

@@ -18,6 +18,7 @@ from orchestration.cli import main
 from orchestration.control import add_control
 from orchestration.create import create
 from orchestration.executors import SerialExecutor, executor_for
+from orchestration.reconcile import reconcile
 from orchestration.run import run
 from orchestration.verify import Verified, verify
 from orchestration.withdraw import withdraw
@@ -429,3 +430,29 @@ def test_a_form_that_is_not_known_is_refused(base: Path) -> None:
 def test_every_kind_is_explained() -> None:
     page = (Path(__file__).parents[2] / "docs" / "quality.md").read_text(encoding="utf-8")
     assert [kind for kind in KINDS if f"`{kind}`" not in page] == []
+
+
+@pytest.mark.parametrize("part", ["covariance", "mean", "root", "prior_value"])
+def test_what_was_reconciled_is_made_anew(base: Path, part: str) -> None:
+    """A sound network is sound reconciled, and with a block less since; one number of what is kept changed is found."""
+    reconcile(str(base), HERE)
+    if part == "covariance":
+        assert verify(str(base), HERE).ok
+    blocks = list(Snapshot.open(str(base)).ledger(["block_id"])["block_id"])
+    withdraw(str(base), HERE, block=blocks[3])
+    assert verify(str(base), HERE).ok
+    store = Store(base)
+    states, trees = "reconciled/tiles/" + store.owner, group_of(store.root, "reconciled/trees")
+    if part in ("mean", "prior_value"):
+        store.edit(states, **{part: scaled(2, 1.001)})
+    else:
+        node = next(name for name in sorted(trees.group_keys()) if "root" in group_of(trees, name).array_keys())
+        array = array_of(group_of(store.root, states) if part == "covariance" else group_of(trees, node), part)
+        values = np.asarray(array[:, :])
+        values[0, 0] *= 1.001
+        array[:, :] = values
+    store.commit()
+    problems = verify(str(base), HERE).problems
+    assert {problem.kind for problem in problems} == {"stale-state"}
+    if part != "root":
+        assert {problem.tile for problem in problems} == {store.owner}
