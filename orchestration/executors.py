@@ -34,6 +34,14 @@ class Executor(Protocol):
         """Run a function for every tuple of arguments, a bounded number at a time; handles in the same order, all done."""
         ...
 
+    def submit(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
+        """A handle of what a function will give once its arguments are there. Nothing bounds how many are under way."""
+        ...
+
+    def wait(self, handles: Sequence[Any], advance: Advance) -> None:
+        """Wait until all of some handles are done."""
+        ...
+
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """The values of some handles."""
         ...
@@ -68,6 +76,15 @@ class SerialExecutor:
             done.append(function(*args))
             advance()
         return done
+
+    def submit(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
+        """See `Executor.submit`."""
+        return function(*arguments)
+
+    def wait(self, handles: Sequence[Any], advance: Advance) -> None:
+        """See `Executor.wait`."""
+        for _ in handles:
+            advance()
 
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""
@@ -104,7 +121,7 @@ class DaskExecutor:
             k = next(waiting, None)
             if k is None:
                 return None
-            handles[k] = self.client.submit(function, *arguments[k], pure=False, key=f"{name}-{os.urandom(6).hex()}")
+            handles[k] = self._start(function, arguments[k], name)
             # a loss from here on cancels the handle; one before it is seen here, and nowhere else
             self._check_scheduler()
             return handles[k]
@@ -120,6 +137,25 @@ class DaskExecutor:
                 if following is not None:
                     running.add(following)
         return handles
+
+    def submit(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
+        """See `Executor.submit`."""
+        with self._losses_said():
+            return self._start(function, arguments, name)
+
+    def _start(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
+        return self.client.submit(function, *arguments, pure=False, key=f"{name}-{os.urandom(6).hex()}")
+
+    def wait(self, handles: Sequence[Any], advance: Advance) -> None:
+        """See `Executor.wait`."""
+        from distributed import as_completed
+
+        with self._losses_said():
+            self._check_scheduler()
+            for future in as_completed(handles):
+                if future.status != "finished":
+                    future.result()  # raises the task's error here
+                advance()
 
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""

@@ -6,7 +6,7 @@ Workers compute and write to forks of the coordinator's session, as in every cha
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -169,39 +169,39 @@ def _reconcile_tree(
 ) -> tuple[Message, list[icechunk.ForkSession]]:  # fmt: skip
     """Messages up and states down one tree: what its root says of the whole part, and what was written."""
     shared = executor.share(Snapshot(base.root, base.place, replace(base.cover, area=b"")))
-    nodes, levels = tree.nodes, tree.levels()
-    of_tile = [k for k, node in enumerate(nodes) if node.tile >= 0]
-    messages: list[Any] = [None] * len(nodes)
-    advance = reporter.stage("collecting from tiles", len(nodes))
+    nodes, messages = tree.nodes, collected(tree, shared, vectors, executor)
+    executor.wait(messages, reporter.stage("collecting from tiles", len(nodes)))
+    (whole,) = executor.results(messages[-1:])
+    writes: list[Any] = []
 
-    def run(function: Callable[..., Any], places: Sequence[int], arguments: Sequence[tuple[Any, ...]], task: str, into: list[Any]) -> None:
-        for k, handle in zip(places, executor.submit_all(function, arguments, task, advance), strict=True):
-            into[k] = handle
+    def down(k: int, above: Any) -> None:
+        """Depth first, so that what a node has given is freed soon: the handles are let go here, once they are arguments."""
+        node = nodes[k]
+        if not node.children:
+            task = (session.fork(), shared, name, k, node, vectors[node.tile], above)
+            writes.append(executor.submit(distribute_tile, task, "distribute-tile"))
+            return
+        below = [messages[c] for c in node.children]
+        state = executor.submit(distribute_node, (session.fork(), name, k, node, below, above), "distribute-node")
+        writes.append(executor.submit(writes_of, (state,), "writes-of"))
+        for child in node.children:
+            messages[child] = None
+            down(child, state)
 
-    run(collect_tile, of_tile, [(shared, nodes[k], vectors[nodes[k].tile]) for k in of_tile], "collect-tile", messages)
-    for level in levels:
-        run(collect_node, level, [(nodes[k], [messages[c] for c in nodes[k].children]) for k in level], "collect-node", messages)
+    down(len(nodes) - 1, None)
+    executor.wait(writes, reporter.stage("distributing to tiles", len(nodes)))
+    return whole, executor.results(writes)
 
-    states: list[Any] = [None] * len(nodes)
-    writes: list[icechunk.ForkSession] = []
-    parents, advance = tree.parents(), reporter.stage("distributing to tiles", len(nodes))
 
-    def above(k: int) -> Any:
-        return states[parents[k]] if parents[k] >= 0 else None
-
-    def keep_writes(places: Sequence[int]) -> None:
-        quiet = reporter.stage("distributing to tiles", 0)
-        writes.extend(executor.results(executor.submit_all(writes_of, [(states[k],) for k in places], "writes-of", quiet)))
-
-    (whole,) = executor.results([messages[-1]])
-    for level in reversed(levels):
-        arguments = [(session.fork(), name, k, nodes[k], [messages[c] for c in nodes[k].children], above(k)) for k in level]
-        run(distribute_node, level, arguments, "distribute-node", states)
-        keep_writes(level)
-    tiles = [(session.fork(), shared, name, k, nodes[k], vectors[nodes[k].tile], above(k)) for k in of_tile]
-    finished: list[Any] = [None] * len(nodes)
-    run(distribute_tile, of_tile, tiles, "distribute-tile", finished)
-    return whole, [*writes, *executor.results([finished[k] for k in of_tile])]
+def collected(tree: TileTree, shared: Any, vectors: Mapping[int, Vectors], executor: Executor) -> list[Any]:
+    """Messages of all nodes of a tree, children before parents; ``shared`` is the version (or a handle of it) with the cells."""
+    messages: list[Any] = []
+    for node in tree.nodes:
+        if node.children:
+            messages.append(executor.submit(collect_node, (node, [messages[c] for c in node.children]), "collect-node"))
+        else:
+            messages.append(executor.submit(collect_tile, (shared, node, vectors[node.tile]), "collect-tile"))
+    return messages
 
 
 def collect_tile(base: Snapshot, node: TreeNode, vectors: Vectors) -> Message:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
-from orchestration.reconcile import collect_node, collect_tile, eliminate_node, eliminate_tile, plan_trees
+from orchestration.reconcile import collected, eliminate_node, eliminate_tile, plan_trees
 from submin.network.outside_messages import Elimination, Message, State, complete, unpacked_state
 from submin.network.whitened_vectors import Vectors
 from submin.storage.network_store import Snapshot
@@ -57,29 +57,22 @@ def verify_reconciled(snapshot: Snapshot, executor: Executor, reporter: Reporter
 def _of_tree(
     snapshot: Snapshot, then: Snapshot, name: str, tree: TileTree, vectors: dict[int, Vectors], executor: Executor, reporter: Reporter
 ) -> list[Problem]:
-    kept, cells = (Snapshot(s.root, s.place, replace(s.cover, area=b"")) for s in (snapshot, then))
-    nodes, parents, advance = tree.nodes, tree.parents(), reporter.stage("verifying what was reconciled", 2 * len(tree.nodes))
-    messages: list[Any] = [None] * len(nodes)
-    states: list[Any] = [None] * len(nodes)
-    leaves = [k for k, node in enumerate(nodes) if node.tile >= 0]
-    upward = executor.submit_all(collect_tile, [(cells, nodes[k], vectors[nodes[k].tile]) for k in leaves], "verify-up", advance)
-    for k, handle in zip(leaves, upward, strict=True):
-        messages[k] = handle
-    for level in tree.levels():
-        arguments = [(nodes[k], [messages[c] for c in nodes[k].children]) for k in level]
-        for k, handle in zip(level, executor.submit_all(collect_node, arguments, "verify-up", advance), strict=True):
-            messages[k] = handle
-    for level in (*reversed(tree.levels()), tuple(leaves)):
-        down = []
-        for k in level:
-            above = states[parents[k]] if parents[k] >= 0 else None
-            of_tile = vectors.get(nodes[k].tile)
-            down.append((kept, cells, name, k, nodes[k], of_tile, [messages[c] for c in nodes[k].children], above))
-        for k, handle in zip(level, executor.submit_all(check_node, down, "verify-down", advance), strict=True):
-            states[k] = handle
-    quiet = reporter.stage("verifying what was reconciled", 0)
-    found = executor.results(executor.submit_all(problems_of, [(state,) for state in states], "problems-of", quiet))
-    return [problem for of_node in found for problem in of_node]
+    kept, cells = (executor.share(Snapshot(s.root, s.place, replace(s.cover, area=b""))) for s in (snapshot, then))
+    nodes, messages = tree.nodes, collected(tree, cells, vectors, executor)
+    found: list[Any] = []
+
+    def down(k: int, above: Any) -> None:
+        node = nodes[k]
+        below = [messages[c] for c in node.children]
+        checked = executor.submit(check_node, (kept, cells, name, k, node, vectors.get(node.tile), below, above), "verify-node")
+        found.append(executor.submit(problems_of, (checked,), "problems-of"))
+        for child in node.children:
+            messages[child] = None
+            down(child, checked)
+
+    down(len(nodes) - 1, None)
+    executor.wait(found, reporter.stage("verifying what was reconciled", len(nodes)))
+    return [problem for of_node in executor.results(found) for problem in of_node]
 
 
 def problems_of(checked: Checked) -> tuple[Problem, ...]:

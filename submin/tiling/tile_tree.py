@@ -58,13 +58,6 @@ class TileTree:
                 parent[child] = k
         return tuple(parent)
 
-    def levels(self) -> tuple[tuple[int, ...], ...]:
-        """Inner nodes whose children are done once the levels before are; tiles are no level."""
-        height = [0] * len(self.nodes)
-        for k, node in enumerate(self.nodes):
-            height[k] = 1 + max(height[child] for child in node.children) if node.children else 0
-        return tuple(tuple(k for k, h in enumerate(height) if h == level) for level in range(1, max(height, default=0) + 1))
-
 
 def trees_of(tiles: Sequence[int], held: Sequence[Names], at: Array) -> tuple[TileTree, ...]:
     """Trees over some tiles, one for each connected part.
