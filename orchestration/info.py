@@ -12,6 +12,7 @@ from submin.sensors import SURVEYS
 from submin.storage.accuracy_map import accuracy_of_all
 from submin.storage.dense_reader import DenseReader
 from submin.storage.ledger import Ledger
+from submin.storage.reconciled import ReconciledStore
 
 
 def describe(network: Network) -> dict[str, Any]:
@@ -42,6 +43,7 @@ def describe(network: Network) -> dict[str, Any]:
         "tiles": len(snapshot.tile_numbers()),
         "tiles_of_the_area": network.cover.tile_count,
         "cells": len(cells),
+        "reconciled": _reconciled(network),
         "ce90_median": float(np.median(accuracy.ce90[reported])) if reported.any() else float("nan"),
         "le90_median": float(np.median(accuracy.le90[reported])) if reported.any() else float("nan"),
         "tile_km": network.cover.core / 1000.0,
@@ -50,6 +52,16 @@ def describe(network: Network) -> dict[str, Any]:
         "frame": snapshot.metadata.frame,
         "bytes": _size(snapshot.place),
     }
+
+
+def _reconciled(network: Network) -> str:
+    """Version to which all tiles are reconciled, ``v9 in part`` where some changed since, or nothing."""
+    known = ReconciledStore.of(network.snapshot)
+    trees = known.trees().values()
+    if not trees:
+        return "no"
+    last = max(tree.version for tree in trees)
+    return f"v{last}" if known.current(network.snapshot.tile_numbers()) else f"v{last}, and changed since"
 
 
 def _describe_dense(network: Network, dense: DenseReader) -> dict[str, Any]:

@@ -23,7 +23,6 @@ from submin.errors import InputError
 from submin.network.outside_messages import Elimination, Message, State, complete, eliminate, front_of
 from submin.network.sub_min import add_sums
 from submin.network.whitened_vectors import Vectors, vectors_of
-from submin.query.outside import other_priors
 from submin.storage.dense_reader import is_dense
 from submin.storage.network_store import Snapshot, begin_change, commit
 from submin.storage.reconciled import (
@@ -122,11 +121,8 @@ def reconcile(place: str, executor: Executor, reporter: Reporter | None = None) 
 def reconcile_changes(place: str, executor: Executor, reporter: Reporter | None = None) -> ReconcileResult | None:
     """Reconcile a network after a change; None where nothing lies outside of a tile, or nothing has changed."""
     latest = Snapshot.open(place)
-    if len(latest.tile_numbers()) < 2:
-        return None
-    known = ReconciledStore.of(latest)
-    trees = known.trees().values()
-    if trees and all(tree.version >= max(known.changed.values(), default=0) for tree in trees):
+    tiles = latest.tile_numbers()
+    if len(tiles) < 2 or ReconciledStore.of(latest).current(tiles):
         return None
     done = reconcile(place, executor, reporter)
     return done if done.version != latest.version else None
@@ -159,8 +155,7 @@ def _standing(known: ReconciledStore, tree: TileTree, vectors: Mapping[int, Vect
         state is not None and np.array_equal(state.vectors.names, vectors[tile].names)
         for tile, state in zip(tree.tiles, states, strict=True)
     )
-    changed = any(known.changed.get(tile, 0) > before.version for tile in tree.tiles)
-    return name if same and not changed and not other_priors(before, known.released) else None
+    return name if same and known.stands(before) else None
 
 
 def _reconcile_tree(

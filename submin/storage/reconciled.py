@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from submin.network.outside_messages import Elimination, State, unpacked_state
 from submin.network.whitened_vectors import PASS, Vectors, WholeImages, vectors_of
-from submin.query.outside import TileState, TreeState
+from submin.query.outside import TileState, TreeState, other_priors
 from submin.query.source import NetworkSource
 from submin.storage.arrays import array_of, attributes_of, group_of, read_record, read_table, replace_table, write_record
 from submin.storage.network_store import Snapshot
@@ -271,6 +271,16 @@ class ReconciledStore:
         """The whitened vectors of images of the present version."""
         whole = ImageDirectory(self._snapshot).whole(images)
         return vectors_of(whole, images, self._snapshot.metadata.parameters, shared_names(self._snapshot))
+
+    def current(self, tiles: Iterable[int]) -> bool:
+        """True when the states of all tiles of the network, ``tiles``, stand as they are."""
+        trees = self.trees().values()
+        reconciled: frozenset[int] = frozenset().union(*(tree.tiles for tree in trees))
+        return reconciled >= set(tiles) and all(self.stands(tree) for tree in trees)
+
+    def stands(self, tree: TreeState) -> bool:
+        """True when nothing has changed in a part of the network since it was reconciled."""
+        return not any(self.changed.get(tile, 0) > tree.version for tile in tree.tiles) and not other_priors(tree, self.released)
 
     def trees(self) -> dict[str, TreeState]:
         """All parts of the network that have been reconciled and that tiles refer to."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,8 @@ def test_the_main_job(shell: Shell, place: Path) -> None:
     assert (created["tile_km"], created["overlap_km"]) == (60.0, 20.0)
 
     first = shell.json("run", catalogue, network)
-    assert first["version"] == "v1"
+    assert first["version"] == "v2"  # the blocks, and then what lies outside of each tile
+    assert first["reconciled"]["tiles"] == created["tiles"]
     assert first["blocks_fused"] == made["blocks"]
     assert first["blocks_rejected"] == []
     assert [flag["image_id"] for flag in first["images_flagged"]] == made["bad_cameras"]
@@ -68,7 +70,8 @@ def test_the_main_job(shell: Shell, place: Path) -> None:
     assert 0.3 < first["ray_rms_px"] < 0.5
     assert first["peak_memory_mb"] > 0
     again = shell.json("run", catalogue, network)
-    assert (again["blocks_fused"], again["blocks_skipped"], again["version"]) == (0, made["blocks"], "v1")
+    assert (again["blocks_fused"], again["blocks_skipped"], again["version"]) == (0, made["blocks"], "v2")
+    assert "reconciled" not in again
     assert again["ray_rms_px"] == first["ray_rms_px"]
     assert "nothing is left to do" in shell("run", catalogue, network)[0]
 
@@ -94,7 +97,26 @@ def test_the_main_job(shell: Shell, place: Path) -> None:
     described = shell.json("info", network)
     assert described["points"] == asked["points"]
     assert described["blocks"] == made["blocks"]
-    assert [v["version"] for v in shell.json("history", network)["versions"]] == ["v1", "v0"]
+    assert [v["version"] for v in shell.json("history", network)["versions"]] == ["v2", "v1", "v0"]
+
+
+def test_reconciling_and_leaving_it_out(shell: Shell, place: Path) -> None:
+    """A tile of a reconciled network is the whole network's; without, it says that it is not; what is done is not done again."""
+    network = shutil.copytree(place / "network", place / "unreconciled")
+    tile = shell.json("query", network, "--bbox", 99, 34, 101, 36)["tiles"][0]
+    assert shell.json("query", network, "--tile", tile)["scope"] == "network"
+    assert shell.json("query", network, "--tile", tile, "--at", "v1")["scope"] == "tiles"
+    assert "nothing has changed since it was reconciled" in shell("reconcile", network)[0]
+    assert shell.json("withdraw", network, "--block", "T000-000", "--no-reconcile")["version"] == "v3"
+    assert shell.json("query", network, "--tile", tile)["scope"] == "tiles"
+    done = shell.json("reconcile", network)
+    assert (done["version"], done["parts"]) == ("v4", 1)
+    assert shell.json("query", network, "--tile", tile)["scope"] == "network"
+    out, _ = shell("run", place / "catalogue", network)
+    assert "v5: 1 blocks fused" in out
+    assert "v6: " in out
+    assert "reconciled with what lies outside" in out
+    assert shell.json("info", network)["reconciled"] == "v6"
 
 
 def test_a_query_outside_is_empty_and_says_so(shell: Shell, place: Path) -> None:
@@ -109,7 +131,7 @@ def test_a_query_outside_is_empty_and_says_so(shell: Shell, place: Path) -> None
         (["query", "nowhere", "--bbox", 0, 0, 1, 1], "nowhere: no such network; make one with 'submin create'"),
         (["query", "{network}", "--bbox", 34, 99, 36, 101], "longitude and latitude look swapped"),
         (["query", "{network}", "--bbox", 99, 34, 101, 36, "--policy", "best"], "policy is 'best'; expected one of auto, tile, ci"),
-        (["query", "{network}", "--bbox", 99, 34, 101, 36, "--at", "v9"], "version is 'v9'; expected one of v0 to v1"),
+        (["query", "{network}", "--bbox", 99, 34, 101, 36, "--at", "v9"], "version is 'v9'; expected one of v0 to v2"),
         (["query", "{network}", "--tile", "r9"], "tile is 'r9'"),
         (["query", "{network}"], "expected one of bbox, area, points, or a tile"),
         (["query", "{network}", "--bbox", 99, 34, 101, 36, "--out", "{network}/../x.xls"], ".parquet"),

@@ -40,8 +40,8 @@ def test_tags_name_versions_and_stay(shell: Shell, place: Path) -> None:
     assert shell.json("tag", network, "delivered", "--at", "v1") == {"version": "v1", "tags": ["delivered"]}
     first = shell.json("query", network, "--bbox", 99, 34, 101, 36, "--at", "delivered")
     assert first["version"] == "v1"
-    shell("withdraw", network, "--block", "T000-000")
-    shell("run", place / "catalogue", network)
+    shell("withdraw", network, "--block", "T000-000", "--no-reconcile")
+    shell("run", place / "catalogue", network, "--no-reconcile")
     assert shell.json("info", network)["version"] == "v4"
     again = shell.json("query", network, "--bbox", 99, 34, 101, 36, "--at", "delivered")
     assert (again["version"], again["ce90_median"]) == ("v1", first["ce90_median"])
