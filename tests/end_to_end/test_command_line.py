@@ -227,7 +227,7 @@ def test_blocks_are_adjusted_and_readjusted(shell: Shell, place: Path, tmp_path:
     assert "no accuracy is stated" in out
 
     readjusted = shell.json("readjust", source.path, network, "--out", tmp_path / "cameras")
-    assert (readjusted["version"], readjusted["blocks"], readjusted["blocks_missing"]) == ("v1", len(others), [new.block_id])
-    assert shell.json("info", network)["version"] == "v1"
+    assert (readjusted["version"], readjusted["blocks"], readjusted["blocks_missing"]) == ("v2", len(others), [new.block_id])
+    assert shell.json("info", network)["version"] == "v2"
     out, _ = shell("readjust", source.path, network, "--block", others[0].block_id, "--out", tmp_path / "one")
     assert "3 images of 1 block, from" in out and "(resection; policy " in out

@@ -95,6 +95,7 @@ def test_control_and_withdrawal_on_the_command_line(shell: Shell, place: Path) -
     rows = ["point_id,longitude,latitude,height,sigma_e,sigma_n,sigma_u"]
     rows += [f"{p},{lon:.9f},{lat:.9f},{h:.4f},0.1,0.1,0.2" for p, (lon, lat, h) in zip(answer.ids, answer.geodetic, strict=True)]
     (place / "control.csv").write_text("\n".join(rows))
+    shell("reconcile", network)
     before = shell.json("info", network)
     added = shell.json("control", "add", network, place / "control.csv")
     assert added["control_fused"] == len(answer)
