@@ -105,15 +105,15 @@ class HeightRange(NamedTuple):
 
 
 def scene_camera(
-    orbit_axes: Array, orbit_radius: float, view: View, centre: Array, scene: float, ellipsoid: Ellipsoid = WGS84
+    orbit_axes: Array, orbit_radius: float, view: View, centre: Array, scene: tuple[float, float], ellipsoid: Ellipsoid = WGS84
 ) -> tuple[LinearArrayCamera, int]:
-    """Camera whose image of ``scene`` metres by ``scene`` metres has its centre on a ground point, and its number of lines.
+    """Camera whose image of a scene has its centre on a ground point, and its number of lines.
 
     Parameters
     ----------
     orbit_axes, orbit_radius : see `LinearArrayCamera`
     centre : (1, 3), geocentric, metres; it should lie near the plane of the orbit
-    scene : side of the scene, metres
+    scene : width and length of the scene, across and along the track, metres
     """
     pitch = float(np.radians(view.pitch))
     # A first camera without the scale, only to aim and to measure the distance along the optical axis.
@@ -121,10 +121,10 @@ def scene_camera(
     angle = float(aiming.orbit_angle(centre)[0])
     satellite = orbit_radius * (np.cos(angle) * orbit_axes[0] + np.sin(angle) * orbit_axes[1])
     distance = float(np.linalg.norm(centre[0] - satellite))
-    pixels = round(scene / view.pixel)
+    pixels, lines = (round(side / view.pixel) for side in scene)
     line_angle = view.pixel / float(np.linalg.norm(centre))
-    first = angle - 0.5 * (pixels - 1) * line_angle
-    return LinearArrayCamera(orbit_axes, orbit_radius, pitch, view.pixel / distance, line_angle, first, pixels, ellipsoid), pixels
+    first = angle - 0.5 * (lines - 1) * line_angle
+    return LinearArrayCamera(orbit_axes, orbit_radius, pitch, view.pixel / distance, line_angle, first, pixels, ellipsoid), lines
 
 
 def rpc_image(

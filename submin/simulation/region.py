@@ -336,7 +336,7 @@ def _triplet(design: RegionDesign, frame: RegionFrame, scene: _Scene) -> list[Si
     heights = HeightRange(-0.1 * design.relief_m, 0.5 * design.relief_m, 1.1 * design.relief_m)
     images = []
     for view in design.views:
-        camera, lines = scene_camera(axes, orbit_radius, view, middle, 1e3 * design.scene_km, frame.ellipsoid)
+        camera, lines = scene_camera(axes, orbit_radius, view, middle, (1e3 * design.scene_km, 1e3 * design.scene_km), frame.ellipsoid)
         seconds = camera.seconds(0.5 * (lines - 1))
         acquired = FIRST_PASS + datetime.timedelta(days=DAYS_BETWEEN_PASSES * scene.strip, milliseconds=round(1e3 * seconds))
         images.append(
