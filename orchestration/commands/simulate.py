@@ -93,9 +93,11 @@ def simulate_china_command(
     """
     from orchestration.simulate import shared_data
     from submin.formats.outlines import named_polygons
-    from submin.simulation.china import china
+    from submin.simulation.china import check_asked, china
 
     check_range("--seed", seed, 0)
+    check_range("--workers", workers, 0, MOST_WORKERS)
+    check_asked(scale, error)
     countries = shared_data("footprints_world/naturalearth_lowres/naturalearth_lowres.shp")
     outline = named_polygons(countries, "name")["China"]
     write_simulated(china(outline, scale, seed, error), catalogue, workers, as_json)
@@ -107,7 +109,6 @@ def write_simulated(campaign: Campaign, catalogue: Path, workers: int, as_json: 
     from orchestration.progress import progress_bars
     from orchestration.simulate import simulate_campaign
 
-    check_range("--workers", workers, 0, MOST_WORKERS)
     started = time.perf_counter()
     with progress_bars(quiet=as_json) as reporter, executor_for(workers) as executor:
         size = simulate_campaign(campaign, catalogue, executor, reporter)

@@ -142,10 +142,7 @@ def china(outline: BaseGeometry, scale: float = 1.0, seed: int = 0, error: str =
     InputError
         When the scale leaves no triplet or is too large, or the kind of error is unknown.
     """
-    if not 0.5 / TRIPLETS <= scale <= MOST_COPIES:
-        raise InputError(f"--scale is {scale:g}; expected {1 / TRIPLETS:.1g} (one triplet) to {MOST_COPIES} (Chinas side by side)")
-    if error not in ERRORS:
-        raise InputError(f"--error is {error!r}; expected one of {', '.join(ERRORS)}")
+    check_asked(scale, error)
     left = round(TRIPLETS * scale)
     scenes: list[Scene] = []
     while left > 0:
@@ -160,6 +157,14 @@ def china(outline: BaseGeometry, scale: float = 1.0, seed: int = 0, error: str =
     )  # fmt: skip
     name = f"simulated China, scale {scale:g}, error {error}, seed {seed}"
     return Campaign(name, design, tuple(scenes), max(LEAST_CHECK_POINTS, round(CHECK_POINTS * scale)), sub_areas)
+
+
+def check_asked(scale: float, error: str) -> None:
+    """Refuse a scale or a kind of error that `china` does not know."""
+    if not 1.0 / TRIPLETS <= scale <= MOST_COPIES:
+        raise InputError(f"--scale is {scale:g}; expected {1 / TRIPLETS:.6f} (one triplet) to {MOST_COPIES} (Chinas side by side)")
+    if error not in ERRORS:
+        raise InputError(f"--error is {error!r}; expected one of {', '.join(ERRORS)}")
 
 
 def turn(copy: int) -> Array:
