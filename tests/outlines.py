@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import gzip
-
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from real_data import FOLDER
 from shapely.geometry.base import BaseGeometry
 
-from submin.formats.outlines import named_polygons
+from submin.formats.outlines import landsat_outlines, named_polygons
 
 WORLD = FOLDER / "footprints_world"
 
@@ -22,6 +20,4 @@ def continents() -> dict[str, BaseGeometry]:
 
 def landsat_rings() -> list[NDArray[np.float64]]:
     """Outlines (n, 2) of the Landsat WRS-2 scenes, those in one part; longitude and latitude in degrees."""
-    with gzip.open(WORLD / "wrs2_descending.csv.gz", "rt", encoding="utf-8") as stream:
-        rings = [row["ring_lonlat"] for row in csv.DictReader(stream)]
-    return [np.array([point.split() for point in ring.split(";")], dtype=np.float64) for ring in rings if "|" not in ring]
+    return [np.asarray(shapely.get_coordinates(scene.outline)) for scene in landsat_outlines(WORLD / "wrs2_descending.csv.gz")]

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from submin.simulation.campaign import Campaign
     from submin.simulation.scene import Layout
 
+COUNTRIES = "footprints_world/naturalearth_lowres/naturalearth_lowres.shp"
+
 app = typer.Typer(no_args_is_help=True, help="Make a catalogue of simulated images, with truth.")
 
 
@@ -98,9 +100,45 @@ def simulate_china_command(
     check_range("--seed", seed, 0)
     check_range("--workers", workers, 0, MOST_WORKERS)
     check_asked(scale, error)
-    countries = shared_data("footprints_world/naturalearth_lowres/naturalearth_lowres.shp")
-    outline = named_polygons(countries, "name")["China"]
+    outline = named_polygons(shared_data(COUNTRIES), "name")["China"]
     write_simulated(china(outline, scale, seed, error), catalogue, workers, as_json)
+
+
+@app.command("footprints")
+def simulate_footprints_command(
+    catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")],
+    region: Annotated[
+        str, typer.Option("--region", help="Real scenes: australia (385 of Landsat) or morocco (238 of WorldView).")
+    ] = "australia",
+    scale: Annotated[float, typer.Option("--scale", help="Part of the scenes, those nearest to the middle.")] = 1.0,
+    seed: Seed = 0,
+    error: Annotated[str, typer.Option("--error", help="Shift of images: independent, common to a pass, or mixed.")] = "mixed",
+    workers: Workers = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate images whose footprints are those of real scenes: how they overlap is real, their measurements and errors are not.
+
+    The outlines are read from the shared data (SUBMIN_DATA). The catalogue is the same for any number of workers.
+
+    Example: submin simulate footprints --out catalogue --region morocco
+    """
+    from orchestration.simulate import shared_data
+    from submin.errors import InputError
+    from submin.formats.outlines import landsat_outlines, named_polygons, satellite_scenes
+    from submin.simulation.china import ERRORS, check_error
+    from submin.simulation.footprints import REGIONS, australia, morocco
+
+    check_range("--seed", seed, 0)
+    check_range("--workers", workers, 0, MOST_WORKERS)
+    check_error(error)
+    if region not in REGIONS:
+        raise InputError(f"--region is {region!r}; expected one of {', '.join(REGIONS)}")
+    if region == "morocco":
+        campaign = morocco(satellite_scenes(shared_data("footprints_world/maxar_open_data_scenes.jsonl.gz")), scale, seed, ERRORS[error])
+    else:
+        land = named_polygons(shared_data(COUNTRIES), "name")["Australia"]
+        campaign = australia(landsat_outlines(shared_data("footprints_world/wrs2_descending.csv.gz")), land, scale, seed, ERRORS[error])
+    write_simulated(campaign, catalogue, workers, as_json)
 
 
 def write_simulated(campaign: Campaign, catalogue: Path, workers: int, as_json: bool) -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import gzip
+import json
 import struct
+from dataclasses import dataclass
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import shapely
+import shapely.geometry
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
@@ -65,3 +71,80 @@ def _dbf(path: Path, name: str) -> list[str]:
             return [content[row : row + size].decode(encoding).strip() for row in rows]
         offset += size
     raise InputError(f"{path}: has no column {name!r}; expected one of {', '.join(names)}")
+
+
+@dataclass(frozen=True)
+class LandsatOutline:
+    """Outline of a Landsat scene (Worldwide Reference System 2), longitude and latitude in degrees."""
+
+    path: int
+    row: int
+    outline: Polygon
+
+
+@dataclass(frozen=True)
+class SatelliteScene:
+    """A real scene, as a public list describes it.
+
+    Attributes
+    ----------
+    scene_id, event, platform : names; time : of acquisition, UTC
+    pixel : on the ground, metres
+    off_nadir, azimuth : of the line of sight, degrees
+    outline : longitude and latitude in degrees, of its largest part
+    """
+
+    scene_id: str
+    event: str
+    platform: str
+    time: datetime
+    pixel: float
+    off_nadir: float
+    azimuth: float
+    outline: Polygon
+
+
+def landsat_outlines(table: Path) -> list[LandsatOutline]:
+    """Outlines of a table (``.csv.gz``) with ``path``, ``row``, ``ring_lonlat``; scenes on the antimeridian, in two parts, are left out.
+
+    Raises
+    ------
+    InputError
+        When the table cannot be read.
+    """
+    try:
+        with gzip.open(table, "rt", encoding="utf-8") as stream:
+            return [
+                LandsatOutline(
+                    int(r["path"]), int(r["row"]), Polygon([[float(v) for v in at.split()] for at in r["ring_lonlat"].split(";")])
+                )
+                for r in csv.DictReader(stream)
+                if "|" not in r["ring_lonlat"]
+            ]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{table}: cannot be read ({error!r}); expected columns path, row, ring_lonlat in .csv.gz") from None
+
+
+def satellite_scenes(table: Path) -> list[SatelliteScene]:
+    """Scenes of a list of JSON objects, one a line (``.jsonl.gz``).
+
+    Raises
+    ------
+    InputError
+        When the list cannot be read.
+    """
+    scenes = []
+    try:
+        with gzip.open(table, "rt", encoding="utf-8") as stream:
+            for line in stream:
+                r = json.loads(line)
+                outline = max(getattr(shape := shapely.geometry.shape(r["geometry"]), "geoms", [shape]), key=lambda part: float(part.area))
+                scenes.append(
+                    SatelliteScene(
+                        r["catalog_id"], r["event"], r["platform"], datetime.fromisoformat(r["datetime"]), float(r["gsd_m"]),
+                        float(r["off_nadir_deg"]), float(r["view_azimuth_deg"]), outline,
+                    )
+                )  # fmt: skip
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{table}: cannot be read ({error!r}); expected a JSON object a line in .jsonl.gz") from None
+    return scenes

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -55,6 +55,7 @@ class Scene:
     width_km, length_km : extent across and along the track
     views : the linear arrays, an image each
     day : of the pass, after the first one
+    outline : of what its images show, where that is not all of their format: WKB, longitude and latitude in degrees
     """
 
     block_id: str
@@ -66,6 +67,7 @@ class Scene:
     length_km: float
     views: tuple[View, ...]
     day: float
+    outline: bytes = b""
 
     def directions(self, forward_km: Array, left_km: Array) -> Array:
         """Directions (n, 3) from the middle of the body, so far from the scene's centre along and across the track, on a mean sphere."""
@@ -188,6 +190,8 @@ def simulate_scene(design: CampaignDesign, scene: Scene) -> SceneRays:
     number = number[keyed_uniform(design.seed, "match", number, key_of(scene.block_id)) < design.matched]
     geodetic = design.grid.geodetic(number)
     inside = shapely.contains_xy(design.outline, geodetic[:, 0], geodetic[:, 1])
+    if scene.outline:
+        inside &= shapely.contains_xy(shapely.from_wkb(scene.outline), geodetic[:, 0], geodetic[:, 1])
     number, geodetic = number[inside], geodetic[inside]
     m, n = len(images), len(number)
     image, point = (index.ravel().astype(np.int32) for index in np.indices((m, n)))
@@ -244,4 +248,4 @@ def _images(design: CampaignDesign, scene: Scene, box: tuple[Array, Array]) -> l
                 platform=design.platform, acquired=time,
             )
         )  # fmt: skip
-    return images
+    return [replace(image, footprint=scene.outline) for image in images] if scene.outline else images

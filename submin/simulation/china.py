@@ -163,6 +163,11 @@ def check_asked(scale: float, error: str) -> None:
     """Refuse a scale or a kind of error that `china` does not know."""
     if not 1.0 / TRIPLETS <= scale <= MOST_COPIES:
         raise InputError(f"--scale is {scale:g}; expected {1 / TRIPLETS:.6f} (one triplet) to {MOST_COPIES} (Chinas side by side)")
+    check_error(error)
+
+
+def check_error(error: str) -> None:
+    """Refuse an unknown kind of error."""
     if error not in ERRORS:
         raise InputError(f"--error is {error!r}; expected one of {', '.join(ERRORS)}")
 
