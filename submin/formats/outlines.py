@@ -6,6 +6,7 @@ import csv
 import gzip
 import json
 import struct
+import zlib
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -121,7 +122,7 @@ def landsat_outlines(table: Path) -> list[LandsatOutline]:
                 for r in csv.DictReader(stream)
                 if "|" not in r["ring_lonlat"]
             ]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, EOFError, zlib.error, ValueError, KeyError) as error:
         raise InputError(f"{table}: cannot be read ({error!r}); expected columns path, row, ring_lonlat in .csv.gz") from None
 
 
@@ -145,6 +146,6 @@ def satellite_scenes(table: Path) -> list[SatelliteScene]:
                         float(r["off_nadir_deg"]), float(r["view_azimuth_deg"]), outline,
                     )
                 )  # fmt: skip
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{table}: cannot be read ({error!r}); expected a JSON object a line in .jsonl.gz") from None
     return scenes

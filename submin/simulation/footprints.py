@@ -21,7 +21,7 @@ from submin.formats.outlines import LandsatOutline, SatelliteScene
 from submin.geodesy import geodetic_to_geocentric, local_axes
 from submin.simulation.campaign import FIRST_PASS, MEAN_RADIUS_KM, Campaign, CampaignDesign, Scene
 from submin.simulation.linear_array import View
-from submin.simulation.point_grid import PointGrid
+from submin.simulation.point_grid import KM_OF_DEGREE, PointGrid
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.str_]
@@ -32,6 +32,8 @@ LANDSAT_VIEWS = (View("FWD", 8.0, 15.0), View("BWD", -8.0, 15.0))
 """The real instrument looks down, and nearly every point would have one ray; so the simulated one looks 8 degrees to and fro."""
 LANDSAT_CYCLE, LANDSAT_STEP, SECONDS_OF_ROW = 16, 7, 24.0
 """A path comes every 16 days, the path west of it 7 days later; from row to row it takes some 24 s."""
+LEAST_FIELDS = 8.0
+"""Of the point grid, that a scene shows. 385 scenes of Landsat touch Australia, some by a corner; a few of Morocco show 20 km2."""
 PASS_SECONDS = 180.0
 CHECK_PART, LEAST_CHECK_POINTS = 0.01, 100
 """Check points, as a part of the fields of the point grid in the outlines."""
@@ -53,7 +55,7 @@ _MOROCCO = _Look(3.0, 1.5, 3000.0, 617.0, "WORLDVIEW-SIMULATED")
 
 
 def australia(scenes: Sequence[LandsatOutline], land: BaseGeometry, scale: float = 1.0, seed: int = 0, error: float = 0.5) -> Campaign:
-    """Stereo pairs with the outlines of the Landsat scenes that touch Australia; a pass is a path, a block a scene.
+    """Stereo pairs with the outlines of Landsat scenes that show Australia; a pass is a path, a block a scene.
 
     Parameters
     ----------
@@ -62,7 +64,7 @@ def australia(scenes: Sequence[LandsatOutline], land: BaseGeometry, scale: float
     error : part of the variance of an image's shift that its pass has in common
     """
     shapely.prepare(land)
-    chosen = [scene for scene in scenes if shapely.intersects(land, scene.outline)]
+    chosen = [scene for scene in scenes if _fields(land, scene.outline, _AUSTRALIA.spacing_km) > LEAST_FIELDS]
     made = [
         _scene(
             f"P{s.path:03d}R{s.row:03d}", f"path-{s.path:03d}", s.outline, lambda _heading: LANDSAT_VIEWS,
@@ -74,11 +76,12 @@ def australia(scenes: Sequence[LandsatOutline], land: BaseGeometry, scale: float
 
 
 def morocco(scenes: Sequence[SatelliteScene], scale: float = 1.0, seed: int = 0, error: float = 0.5) -> Campaign:
-    """One image for each of the scenes of the 2023 earthquake in Morocco, each a block; scenes of one satellite within minutes are a pass.
+    """One image for each of the scenes after the 2023 earthquake in Morocco, each a block; scenes of one satellite within minutes are a pass.
 
     Parameters are those of `australia`; tie points are wherever a scene is.
     """
-    chosen = sorted((s for s in scenes if s.event == EVENT), key=lambda s: (s.platform, s.time, s.scene_id))
+    shown = [s for s in scenes if s.event == EVENT and _fields(s.outline, s.outline, _MOROCCO.spacing_km) > LEAST_FIELDS]
+    chosen = sorted(shown, key=lambda s: (s.platform, s.time, s.scene_id))
     made, pass_id = [], ""
     for k, s in enumerate(chosen):
         before = chosen[k - 1] if k else None
@@ -109,15 +112,22 @@ def _campaign(
     middle = start.mean(axis=0)
     nearest = np.argsort(-(start @ middle), kind="stable")[: max(1, round(scale * len(scenes)))]
     kept = [scenes[k] for k in sorted(nearest.tolist())]
-    shown = shapely.intersection(land, shapely.union_all(shapely.buffer(shapely.from_wkb([s.outline for s in kept]), 0.0)))
+    shown = shapely.union_all(shapely.buffer(shapely.from_wkb([s.outline for s in kept]), 0.0))
     design = CampaignDesign(
         outline=land, grid=PointGrid(look.spacing_km, look.relief_m, seed), seed=seed, orbit_km=look.orbit_km, platform=look.platform,
         priors=APriori(bias_m=look.sigma, common_to_pass=error),
     )  # fmt: skip
-    square_km = shapely.area(shown) * 111.3**2 * np.cos(np.radians(shown.centroid.y))
-    checks = max(LEAST_CHECK_POINTS, round(CHECK_PART * square_km / look.spacing_km**2))
+    checks = max(LEAST_CHECK_POINTS, round(CHECK_PART * _fields(land, shown, look.spacing_km)))
     label = f"simulated images of footprints, {name}, scale {scale:g}, seed {seed}"
     return Campaign(label, design, tuple(kept), checks, lambda geodetic: np.full(len(geodetic), name))
+
+
+def _fields(land: BaseGeometry, outline: BaseGeometry, spacing_km: float) -> float:
+    """About how many fields of a point grid lie in an outline and on land."""
+    part = shapely.intersection(land, outline) if shapely.intersects(land, outline) else shapely.Polygon()
+    if part.is_empty:
+        return 0.0
+    return float(part.area * (KM_OF_DEGREE / spacing_km) ** 2 * np.cos(np.radians(part.centroid.y)))
 
 
 def _scene(name: str, pass_id: str, outline: BaseGeometry, views: Callable[[float], tuple[View, ...]], day: float) -> Scene:

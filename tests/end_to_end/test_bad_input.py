@@ -290,6 +290,7 @@ simply("sigma of an import out of range", lambda w: [*w.isis(), "--sigma", 0])
 simply("scale of a simulation out of range", lambda w: ["simulate", "region", "--out", w.new, "--scale", 0])
 simply("scale of a simulated China out of range", lambda w: ["simulate", "china", "--out", w.new, "--scale", 0])
 simply("unknown kind of error of a simulated China", lambda w: ["simulate", "china", "--out", w.new, "--error", "none"])
+simply("unknown region of simulated footprints", lambda w: ["simulate", "footprints", "--out", w.new, "--region", "mars"])
 simply("negative seed of a simulation", lambda w: ["simulate", "five-blocks", "--out", w.new, "--seed", -1])
 
 
