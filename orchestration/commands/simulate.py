@@ -108,7 +108,7 @@ def simulate_china_command(
 def simulate_footprints_command(
     catalogue: Annotated[Path, typer.Option("--out", help="Catalogue to make.")],
     region: Annotated[
-        str, typer.Option("--region", help="Real scenes: australia (370 of Landsat) or morocco (234 of WorldView, GeoEye).")
+        str, typer.Option("--region", help="Real scenes: australia (372 of Landsat) or morocco (234 of WorldView, GeoEye).")
     ] = "australia",
     scale: Annotated[float, typer.Option("--scale", help="Part of the scenes, those nearest to the middle.")] = 1.0,
     seed: Seed = 0,

@@ -76,7 +76,7 @@ def australia(scenes: Sequence[LandsatOutline], land: BaseGeometry, scale: float
 
 
 def morocco(scenes: Sequence[SatelliteScene], scale: float = 1.0, seed: int = 0, error: float = 0.5) -> Campaign:
-    """One image for each of the scenes after the 2023 earthquake in Morocco, each a block; scenes of one satellite within minutes are a pass.
+    """One image of each scene after the 2023 earthquake in Morocco, each a block; those of one satellite within minutes are a pass.
 
     Parameters are those of `australia`; tie points are wherever a scene is.
     """

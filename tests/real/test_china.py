@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from outlines import WORLD
 from real_data import real_data
 from shapely.geometry.base import BaseGeometry
+from typer.testing import CliRunner
 
+from orchestration.commands.simulate import app
 from orchestration.executors import SerialExecutor, executor_for
 from orchestration.progress import Silent
 from orchestration.simulate import simulate_campaign
@@ -256,3 +258,24 @@ def test_what_cannot_be_simulated_is_refused(outline: BaseGeometry) -> None:
             china(outline, scale)
     with pytest.raises(InputError, match="--error is 'none'; expected one of independent, mixed, common"):
         china(outline, 1.0, error="none")
+
+
+@pytest.mark.parametrize(
+    ("words", "sizes"),
+    [
+        (["china", "--scale", "0.0005", "--error", "common"], {"blocks": 4, "images": 12, "check_points": 100}),
+        (["footprints", "--scale", "0.01"], {"blocks": 4, "images": 8, "check_points": 100}),
+        (["footprints", "--region", "morocco", "--scale", "0.02"], {"blocks": 5, "images": 5, "check_points": 100}),
+    ],
+)
+def test_commands_say_what_they_made(words: list[str], sizes: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SUBMIN_DATA", str(WORLD.parent))
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "catalogue"), "--json"])
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.stdout)
+    assert said["simulated"] is True and {name: said[name] for name in sizes} == sizes
+    summary = Catalogue.open(tmp_path / "catalogue").validate()
+    assert (summary.blocks, summary.images, summary.rays) == (said["blocks"], said["images"], said["rays"])
+    assert len({image.pass_id for image in Catalogue.open(tmp_path / "catalogue").images}) == said["passes"]
+    text = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "again")])
+    assert "simulated" in text.stdout and "passes" in text.stdout
