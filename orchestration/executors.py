@@ -6,7 +6,8 @@ import logging
 import os
 import resource
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -17,6 +18,8 @@ from submin.errors import ClusterError, InputError
 
 SHARED_VALUES_GO_WITH_TASKS = {"distributed.admin.large-graph-warning-threshold": "1GB"}
 """Dask would warn at 10 MB and ask to scatter; `DaskExecutor.share` says why not."""
+STREAMED = 4
+"""Results of a stream that a worker may be ahead of whoever takes them."""
 Advance = Callable[[], None]
 T = TypeVar("T")
 
@@ -40,6 +43,10 @@ class Executor(Protocol):
 
     def wait(self, handles: Sequence[Any], advance: Advance) -> None:
         """Wait until all of some handles are done."""
+        ...
+
+    def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
+        """The values of a function for tuples of arguments, in their order, a bounded number of them at a time: none is kept."""
         ...
 
     def results(self, handles: Sequence[Any]) -> list[Any]:
@@ -85,6 +92,10 @@ class SerialExecutor:
         """See `Executor.wait`."""
         for _ in handles:
             advance()
+
+    def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
+        """See `Executor.stream`."""
+        return (function(*args) for args in arguments)
 
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""
@@ -156,6 +167,18 @@ class DaskExecutor:
                 if future.status != "finished":
                     future.result()  # raises the task's error here
                 advance()
+
+    def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
+        """See `Executor.stream`."""
+        waiting: deque[Any] = deque()
+        with self._losses_said():
+            for args in arguments:
+                waiting.append(self._start(function, args, name))
+                self._check_scheduler()
+                if len(waiting) == STREAMED * self.workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
 
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""

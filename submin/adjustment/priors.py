@@ -10,7 +10,7 @@ that two corrections are equal.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -107,6 +107,9 @@ class APriori:
         For ``fixed`` the correlation (0 to below 1); for the temporal models T in seconds.
     correction : str
         Which parameters of an RPC image are adjustable: ``shift``, ``shift+drift`` (along lines, that is in time) or ``affine``.
+    bias_m : float, optional
+        Instead of ``bias_px``: total sigma of the shift in metres on the ground, along each axis; of each image by the size of its own
+        pixel (`in_pixels`), so that an error common to a pass is the same on the ground in images of different pixels.
     parameters : mapping
         What differs for some parameters, by their name or group (see `submin.sensors.base.Parameter`): any of ``sigma`` (in the
         parameter's unit), ``common_to_pass``, ``correlation``, ``correlation_parameter``. A name goes before its group.
@@ -124,12 +127,13 @@ class APriori:
     correlation_parameter: float = 0.0
     correction: str = "affine"
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, hash=False)
+    bias_m: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("bias_px", "drift_px"):
+        for name, unit in (("bias_px", "pixels"), ("drift_px", "pixels"), ("bias_m", "metres")):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"priors: {name} is {value}; expected a positive number of pixels")
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"priors: {name} is {value}; expected a positive number of {unit}")
         if self.correction not in CORRECTIONS:
             raise InputError(f"priors: correction is {self.correction!r}; expected one of {', '.join(CORRECTIONS)}")
         Uncertainty(1.0, self.common_to_pass, self.correlation, self.correlation_parameter)
@@ -166,16 +170,29 @@ class APriori:
         """The entry of ``priors.json``; what is as it would be without an entry is left out of ``parameters`` and ``correction``."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values["parameters"] = {name: dict(entry) for name, entry in self.parameters.items()}
-        for name in ("correction", "parameters"):
+        for name in ("correction", "parameters", "bias_m"):
             if values[name] == getattr(_PLAIN, name):
                 del values[name]
         return values
 
+    def in_pixels(self, pixel: float) -> APriori:
+        """The model of an image with pixels of this size on the ground, metres: as it is where the shift is stated in pixels.
+
+        Three digits are more than anybody knows of a sigma; so images of one camera have one model.
+
+        Examples
+        --------
+        >>> APriori(bias_m=15.0).in_pixels(2.5).bias_px
+        6.0
+        """
+        return self if self.bias_m is None else replace(self, bias_px=float(f"{self.bias_m / pixel:.3g}"), bias_m=None)
+
     def of(self, parameter: Parameter) -> Uncertainty:
-        """What is believed of a parameter of a sensor."""
+        """What is believed of a parameter of a sensor; a shift that is stated in metres is in metres until `in_pixels`."""
         sigma = parameter.sigma
         if parameter.group in _SIGMA_OF_GROUP:
-            sigma = getattr(self, _SIGMA_OF_GROUP[parameter.group]) if parameter.group in CORRECTIONS[self.correction] else 0.0
+            name = "bias_m" if parameter.group == "bias" and self.bias_m is not None else _SIGMA_OF_GROUP[parameter.group]
+            sigma = getattr(self, name) if parameter.group in CORRECTIONS[self.correction] else 0.0
         stated = {"sigma": sigma, "common_to_pass": self.common_to_pass if parameter.shared else 0.0, **self._common}
         for name in (parameter.group, parameter.name):
             stated |= self.parameters.get(name, {})
@@ -303,20 +320,21 @@ def prior_and_columns(images: Sequence[ImagePrior], parameters: int) -> tuple[sp
 
     entries = _Entries()
     for (_, names), members in blocks.items():
-        model = images[members[0]].a_priori
-        assert model is not None
+        models = [model for i in members if (model := images[i].a_priori) is not None]
         at = np.array(members)
         seconds = np.array([images[i].seconds for i in members])
         released = np.array([images[i].released for i in members])
         factors: dict[tuple[str, float], Array] = {}
         for c, parameter in enumerate(names):
-            stated = _stated(model, parameter)
+            # one model for the block, but a shift stated in metres has each image's own size in pixels
+            stated = _stated(models[0], parameter)
             if not stated.sigma > 0.0:
                 continue
+            sigma = np.array([_stated(model, parameter).sigma for model in models])
             key = stated.correlation, stated.correlation_parameter
             if key not in factors:
                 factors[key] = _own_factor(stated, seconds, released)
-            own = stated.sigma * np.where(released, RELEASE_FACTOR, np.sqrt(1.0 - stated.common_to_pass))
+            own = sigma * np.where(released, RELEASE_FACTOR, np.sqrt(1.0 - stated.common_to_pass))
             entries.add(at * p + c, np.array([own_column[i, c] for i in members]), factors[key] * own[:, None])
     for k, members_of_pass in enumerate(shared.values()):
         rows, sigmas = zip(*members_of_pass, strict=True)

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori, ImagePrior, JointRows
-from submin.errors import StoreError
-from submin.geodesy import Ellipsoid
+from submin.errors import InputError, StoreError
+from submin.geodesy import WGS84, Ellipsoid
 from submin.sensors import sensor_named
+from submin.sensors.footprint import ground_pixels
+from submin.sensors.rpc import image_centres
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class NetworkImage:
     camera : catalogue description, JSON text
     width, height : pixels
     seconds : time of acquisition, seconds since 1970; NaN when unknown
-    a_priori : JSON text of the a priori model of its block, or of its `JointPlace`; empty for an image that has nothing to adjust
+    a_priori : JSON text of its a priori model (in pixels), or of its `JointPlace`; empty for an image that has nothing to adjust
     released : True once its camera was found to be bad and its prior given up
     joint : rows of a common factor, of a view of correlated control
     """
@@ -75,6 +77,34 @@ _JOINT = "joint"
 @lru_cache(maxsize=4096)
 def _packed(sensor: str, camera: str, width: int, height: int) -> NDArray[np.float64]:
     return sensor_named(sensor).pack(json.loads(camera), width, height)
+
+
+def a_priori_text(a_priori: APriori | None, image_id: str, sensor: str, camera: str, width: int, height: int) -> str:
+    """What an image has in ``a_priori``: its block's model, in the image's own pixels where that states the shift of RPCs in metres.
+
+    Raises
+    ------
+    InputError
+        When the camera is not what its sensor model expects, or does not see the ground in the middle of the image.
+    """
+    if a_priori is None:
+        return ""
+    if a_priori.bias_m is not None and sensor == "rpc":
+        pixel = _ground_pixel(camera, width, height)
+        if not np.isfinite(pixel):
+            raise InputError(
+                f"image {image_id}: its camera does not see the ground in the middle of the image, so a shift stated in metres (bias_m of "
+                "the priors) has no size in pixels; mend the camera, or state bias_px"
+            )
+        a_priori = a_priori.in_pixels(pixel)
+    return json.dumps(a_priori.to_mapping(), sort_keys=True)
+
+
+@lru_cache(maxsize=4096)
+def _ground_pixel(camera: str, width: int, height: int) -> float:
+    """Size of a pixel of an RPC image (whose ground is on WGS84) in its middle, metres; NaN where it sees no ground."""
+    packed = _packed("rpc", camera, width, height)[None]
+    return float(ground_pixels(sensor_named("rpc"), packed, image_centres(packed), WGS84)[0])
 
 
 @lru_cache(maxsize=256)

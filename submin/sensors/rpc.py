@@ -209,6 +209,11 @@ class RpcSensor:
         return cameras[:, _H_OFF]
 
 
+def image_centres(cameras: Array) -> Array:
+    """Sample and line (m, 2) of the middle of each image, of packed cameras (m, 94)."""
+    return cameras[:, [_CENTRE_SAMPLE, _CENTRE_LINE]]
+
+
 def _number(camera: Mapping[str, Any], name: str) -> float:
     if name not in camera:
         raise InputError(f"RPC: {name} is missing; expected one number")

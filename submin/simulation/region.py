@@ -16,7 +16,6 @@ its left.
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,35 +28,20 @@ from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori
 from submin.errors import InputError
 from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
-from submin.sensors import Ground, sensor_named
-from submin.sensors.footprint import footprints
-from submin.simulation.rpc_fit import fit_rpc
-from submin.simulation.scene import SimulatedImage, drawn_parameters, simulated_image_set, utc
+from submin.sensors import Ground
+from submin.simulation.linear_array import SENSOR, ZY3_VIEWS, HeightRange, View, rpc_image, scene_camera
+from submin.simulation.scene import SimulatedImage, drawn_parameters, simulated_image_set
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 Ids = NDArray[np.str_]
 
-SENSOR = sensor_named("rpc")
 BIAS = [c for c, parameter in enumerate(SENSOR.parameters) if parameter.group == "bias"]
-GRAVITY_PARAMETER = 3.986004418e14
-"""GM of the Earth, m3/s2 (NIMA TR8350.2): it only sets the times between images."""
 FIRST_PASS = datetime.datetime(2012, 2, 1, 3, 30, tzinfo=datetime.UTC)
 DAYS_BETWEEN_PASSES = 5
 BLUNDER_PX = (5.0, 50.0)
 OVERLAP_IN_STRIP = 0.1
 """Least overlap of neighbouring scenes of a strip, as a part of a scene."""
-
-
-class View(NamedTuple):
-    """One linear array of a three-line camera: name, pitch (degrees, forward positive), size of a pixel on the ground (metres)."""
-
-    name: str
-    pitch: float
-    pixel: float
-
-
-ZY3_VIEWS = (View("FWD", 22.0, 3.5), View("NAD", 0.0, 2.1), View("BWD", -22.0, 3.5))
 
 
 @dataclass(frozen=True)
@@ -267,60 +251,6 @@ class RegionFrame:
         return geodetic
 
 
-@dataclass(frozen=True)
-class LinearArrayCamera:
-    """A linear array across the track, pitched by a fixed angle, on a circular orbit in the body-fixed frame.
-
-    Attributes
-    ----------
-    orbit_axes : (3, 3)
-        Rows: unit vectors to the place where the orbit angle is 0, along the track there, and the pole of the orbit.
-    orbit_radius : float
-        Metres.
-    pitch : float
-        Radians, forward positive.
-    pixel_angle : float
-        Tangent of the angle between two pixels at the centre of the array.
-    line_angle : float
-        Angle that the satellite flies from line to line, radians.
-    first_angle : float
-        Angle of the orbit at the centre of the first line, radians.
-    width : int
-        Pixels of a line.
-    """
-
-    orbit_axes: Array
-    orbit_radius: float
-    pitch: float
-    pixel_angle: float
-    line_angle: float
-    first_angle: float
-    width: int
-    ellipsoid: Ellipsoid = WGS84
-
-    def orbit_angle(self, geocentric: Array) -> Array:
-        """Angles of the orbit (n,), radians, at which the array's plane sweeps over points (n, 3).
-
-        The plane holds a point where ``(X - S) . n = 0``; with X at the angle ``phi`` and the distance ``rho`` in the plane of the orbit
-        this is ``rho sin(pitch - tau + phi) = R sin(pitch)``, solved in closed form.
-        """
-        start, along, _ = self.orbit_axes
-        x, y = geocentric @ start, geocentric @ along
-        return np.asarray(self.pitch + np.arctan2(y, x) - np.arcsin(self.orbit_radius * np.sin(self.pitch) / np.hypot(x, y)))
-
-    def project(self, geodetic: Array) -> Array:
-        """Sample and line (n, 2), pixels, of geodetic coordinates (n, 3); samples grow to the right of the flight."""
-        geocentric = geodetic_to_geocentric(geodetic, self.ellipsoid)
-        start, along, pole = self.orbit_axes
-        angle = self.orbit_angle(geocentric)
-        # From the satellite a point lies in the array's plane, so its distance along the optical axis is all that is left to find.
-        down = self.orbit_radius - np.hypot(geocentric @ start, geocentric @ along) * np.cos(
-            angle - np.arctan2(geocentric @ along, geocentric @ start)
-        )
-        sample = 0.5 * (self.width - 1) - (geocentric @ pole) / (down / np.cos(self.pitch)) / self.pixel_angle
-        return np.stack([sample, (angle - self.first_angle) / self.line_angle], axis=1)
-
-
 def simulate_region(design: RegionDesign) -> SimulatedRegion:
     """Simulate a region: images, points, true parameters, and a ray for every point in every image whose format holds it.
 
@@ -399,57 +329,23 @@ def _triplet(design: RegionDesign, frame: RegionFrame, scene: _Scene) -> list[Si
     low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
     block = f"T{scene.strip:03d}-{scene.number:03d}"
 
+    axes, orbit_radius = frame.orbit_axes(scene.across_km), frame.radius + 1e3 * design.orbit_km
+    middle = geodetic_to_geocentric(
+        frame.geodetic(np.array([scene.along_km]), np.array([scene.across_km]), np.array([0.5 * design.relief_m])), frame.ellipsoid
+    )
+    heights = HeightRange(-0.1 * design.relief_m, 0.5 * design.relief_m, 1.1 * design.relief_m)
     images = []
     for view in design.views:
-        camera, lines = _camera(design, frame, view, scene)
-        rpc, _ = fit_rpc(
-            camera.project,
-            (float(low[0]), float(high[0])),
-            (float(low[1]), float(high[1])),
-            (-0.1 * design.relief_m, 1.1 * design.relief_m),
-        )
-        size, height = np.array([[camera.width, lines]], dtype=np.float64), np.array([0.5 * design.relief_m])
-        packed = SENSOR.pack(rpc, camera.width, lines)[None]
-        (footprint,) = footprints(SENSOR, packed, np.zeros((1, 2)), size, height, frame.ellipsoid)
+        camera, lines = scene_camera(axes, orbit_radius, view, middle, (1e3 * design.scene_km, 1e3 * design.scene_km), frame.ellipsoid)
+        seconds = camera.seconds(0.5 * (lines - 1))
+        acquired = FIRST_PASS + datetime.timedelta(days=DAYS_BETWEEN_PASSES * scene.strip, milliseconds=round(1e3 * seconds))
         images.append(
-            SimulatedImage(
-                image_id=f"{block}-{view.name}",
-                block_id=block,
-                pass_id=f"pass-{scene.strip:03d}",
-                platform="SIM-3LINE",
-                sensor=SENSOR.name,
-                camera=json.dumps(rpc),
-                width=camera.width,
-                height=lines,
-                acquired=_acquired(scene.strip, camera.first_angle + 0.5 * (lines - 1) * camera.line_angle, camera.orbit_radius),
-                footprint=footprint,
+            rpc_image(
+                camera, lines, (low, high), heights, image_id=f"{block}-{view.name}", block_id=block, pass_id=f"pass-{scene.strip:03d}",
+                platform="SIM-3LINE", acquired=acquired,
             )
-        )
+        )  # fmt: skip
     return images
-
-
-def _camera(design: RegionDesign, frame: RegionFrame, view: View, scene: _Scene) -> tuple[LinearArrayCamera, int]:
-    """Camera of one image, its centre on the centre of the scene at mean height, and its number of lines."""
-    pitch = np.radians(view.pitch)
-    axes, radius = frame.orbit_axes(scene.across_km), frame.radius + 1e3 * design.orbit_km
-    height = np.array([0.5 * design.relief_m])
-    centre = geodetic_to_geocentric(frame.geodetic(np.array([scene.along_km]), np.array([scene.across_km]), height), frame.ellipsoid)
-    # A first camera without the scale, only to aim and to measure the distance along the optical axis.
-    aiming = LinearArrayCamera(axes, radius, float(pitch), 1.0, 1.0, 0.0, 1, frame.ellipsoid)
-    angle = float(aiming.orbit_angle(centre)[0])
-    satellite = radius * (np.cos(angle) * axes[0] + np.sin(angle) * axes[1])
-    distance = float(np.linalg.norm(centre[0] - satellite))
-    pixels = round(1e3 * design.scene_km / view.pixel)
-    line_angle = view.pixel / float(np.linalg.norm(centre))
-    first = angle - 0.5 * (pixels - 1) * line_angle
-    return LinearArrayCamera(axes, radius, float(pitch), view.pixel / distance, line_angle, first, pixels, frame.ellipsoid), pixels
-
-
-def _acquired(strip: int, angle: float, orbit_radius: float) -> str:
-    """ISO text of the time at which a strip's satellite passes an angle of its orbit, to the millisecond."""
-    seconds = angle * np.sqrt(orbit_radius**3 / GRAVITY_PARAMETER)
-    time = FIRST_PASS + datetime.timedelta(days=DAYS_BETWEEN_PASSES * strip, milliseconds=round(1e3 * seconds))
-    return utc(time)
 
 
 def _tie_points(design: RegionDesign, rng: np.random.Generator) -> tuple[Ids, Array, Array, Array]:

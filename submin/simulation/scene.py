@@ -10,7 +10,6 @@ with ``K`` the a priori factor of `submin.adjustment.priors`, so a network that 
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +21,7 @@ from submin.accuracy import ce90, le90
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori
 from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
-from submin.network.network_image import NetworkImage, image_set
+from submin.network.network_image import NetworkImage, a_priori_text, image_set
 from submin.sensors import width_of
 
 Array = NDArray[np.float64]
@@ -56,7 +55,7 @@ def simulated_image_set(images: Sequence[SimulatedImage], priors: Mapping[str, A
     members = [
         NetworkImage(
             i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds,
-            json.dumps(priors[i.block_id].to_mapping()),
+            a_priori_text(priors[i.block_id], i.image_id, i.sensor, i.camera, i.width, i.height),
         )
         for i in images
     ]  # fmt: skip

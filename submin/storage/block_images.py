@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 
 from submin.adjustment.joint_errors import JointErrors
 from submin.adjustment.priors import JointRows
-from submin.network.network_image import JointPlace, NetworkImage
+from submin.network.network_image import JointPlace, NetworkImage, a_priori_text
 from submin.storage.catalogue_schema import Block
 
 
 def network_images(block: Block) -> tuple[NetworkImage, ...]:
     """The images of a block of a catalogue as a network has them."""
-    a_priori = "" if block.a_priori is None else json.dumps(block.a_priori.to_mapping(), sort_keys=True)
     images = tuple(
-        NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, a_priori) for i in block.images
-    )
+        NetworkImage(
+            i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds,
+            a_priori_text(block.a_priori, i.image_id, i.sensor, i.camera, i.width, i.height),
+        )
+        for i in block.images
+    )  # fmt: skip
     return images if block.joint is None else _joined(images, block.joint, block.content_hash())
 
 

@@ -72,6 +72,7 @@ class CatalogueWriter:
         self._without_images = True
         self._others = False
         self._images: pq.ParquetWriter | None = None
+        self._points: dict[str, pq.ParquetWriter] = {}
         self._measurements: pq.ParquetWriter | None = None
 
     def __enter__(self) -> Self:
@@ -93,7 +94,7 @@ class CatalogueWriter:
             if kind is None:
                 self._flush()
                 self._flush_observations()
-            for writer in (images, measurements, self._observations):
+            for writer in (images, measurements, self._observations, *self._points.values()):
                 if writer is not None:
                     writer.close()
             if kind is None:
@@ -168,7 +169,7 @@ class CatalogueWriter:
         self._json("priors.json", {"default": default.to_mapping(), "blocks": blocks})
 
     def write_points(self, kind: Literal["control", "check", "truth"], points: PointTable, suffix: str = "") -> None:
-        """Write control points, check points or simulated truth (of which only the coordinates).
+        """Append control points, check points or simulated truth (of which only the coordinates).
 
         A table with a ``suffix`` (``control-SUFFIX``) lies beside the catalogue's own one: no run takes it by itself.
         """
@@ -176,9 +177,10 @@ class CatalogueWriter:
         if kind not in POINT_KINDS:
             raise CatalogueError(f"kind of points is {kind!r}; expected one of {', '.join(POINT_KINDS)}")
         self._others |= kind == "control" and not suffix
-        pq.write_table(
-            point_columns(points, kind != "truth"), self._folder / f"{kind}{suffix and '-' + suffix}.parquet", compression="zstd"
-        )
+        table, stem = point_columns(points, kind != "truth"), f"{kind}{suffix and '-' + suffix}"
+        if stem not in self._points:
+            self._points[stem] = pq.ParquetWriter(self._folder / f"{stem}.parquet", table.schema, compression="zstd")
+        self._points[stem].write_table(table)
 
     def _unwritable(self, cause: OSError) -> CatalogueError:
         return CatalogueError(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.priors import APriori
+from submin.geodesy import geocentric_to_geodetic, geodetic_to_geocentric, local_axes
+from submin.simulation.campaign import SURVEY_SIGMA, Campaign, CampaignDesign, Scene, simulate_scene
+from submin.simulation.keyed_random import keyed_normal, keyed_uniform
 from submin.simulation.region import RegionDesign, SimulatedRegion
 from submin.simulation.scene import SimulatedImage, SimulatedScene, Survey
 from submin.storage.catalogue import Block, CatalogueMetadata, ImageRecord, PointTable
@@ -17,6 +20,7 @@ from submin.storage.catalogue_writer import CatalogueWriter
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
+Numbers = NDArray[np.int64]
 Ids = NDArray[np.str_]
 
 
@@ -91,6 +95,92 @@ def survey_table(scene: SimulatedScene, survey: Survey) -> PointTable:
     layout, rows = scene.layout, survey.points
     covariance = np.broadcast_to(survey.covariance, (len(rows), 3, 3))
     return PointTable(layout.point_ids[rows], scene.coordinates(survey), covariance, layout.area[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignPart:
+    """Blocks of some scenes of a campaign, and the fields (n,) of the points that they measure, ascending."""
+
+    blocks: tuple[Block, ...]
+    points: Numbers
+
+
+@dataclass(frozen=True)
+class CampaignSize:
+    """What a campaign's catalogue holds."""
+
+    blocks: int
+    images: int
+    points: int
+    rays: int
+    check_points: int
+
+
+def campaign_part(design: CampaignDesign, scenes: Sequence[Scene]) -> CampaignPart:
+    """Simulate some scenes of a campaign."""
+    blocks, points = [], []
+    for scene in scenes:
+        rays = simulate_scene(design, scene)
+        row = np.searchsorted(rays.points, rays.number)
+        sigma = np.full(len(row), design.sigma_px)
+        blocks.append(
+            Block(
+                scene.block_id, tuple(ImageRecord(**asdict(image)) for image in rays.images), design.priors,
+                design.grid.ids(rays.points)[row], rays.image, rays.observed[:, 0].copy(), rays.observed[:, 1].copy(), sigma, sigma,
+            )
+        )  # fmt: skip
+        points.append(rays.points)
+    return CampaignPart(tuple(blocks), np.unique(np.concatenate(points)))
+
+
+def write_campaign(campaign: Campaign, parts: Iterable[CampaignPart], path: str | Path, *, overwrite: bool = False) -> CampaignSize:
+    """Write the catalogue of a campaign whose parts come one after another, in the order of its scenes; none is kept.
+
+    The table ``truth`` holds every point, ``check`` some that are surveyed with their sub-areas. What is kept of all parts is one bit a
+    field of the point grid (of which memory takes those pages where there are points) and the check points.
+
+    Raises
+    ------
+    CatalogueError
+        When the folder holds something already.
+    """
+    design, blocks, images, rays, points = campaign.design, 0, 0, 0, 0
+    known = np.zeros(design.grid.fields, dtype=np.bool_)
+    check = np.empty(0, dtype=np.int64)
+    with CatalogueWriter(path, CatalogueMetadata(name=campaign.name), overwrite) as writer:
+        for part in parts:
+            writer.write_images(image for block in part.blocks for image in block.images)
+            for block in part.blocks:
+                writer.write_block(block)
+                blocks, images, rays = blocks + 1, images + len(block.images), rays + len(block)
+            new = part.points[~known[part.points]]
+            known[new] = True
+            points += len(new)
+            truth = design.grid.geodetic(new)
+            writer.write_points("truth", _exact_points(design, new, truth, campaign.area(truth)))
+            check = _first_drawn(design, np.concatenate([check, new]), campaign.check_points)
+        writer.write_priors(design.priors)
+        writer.write_points("check", surveyed_points(campaign, np.sort(check)))
+    return CampaignSize(blocks, images, points, rays, len(check))
+
+
+def surveyed_points(campaign: Campaign, number: Numbers) -> PointTable:
+    """Points of a campaign as a survey states them, with its errors and their covariance."""
+    design = campaign.design
+    truth = design.grid.geodetic(number)
+    enu = SURVEY_SIGMA * keyed_normal(design.seed, "survey", number[:, None], np.arange(2)).reshape(len(number), 4)[:, :3]
+    moved = geocentric_to_geodetic(geodetic_to_geocentric(truth) + np.einsum("nij,ni->nj", local_axes(truth), enu))
+    covariance = np.broadcast_to(SURVEY_SIGMA**2 * np.eye(3), (len(number), 3, 3))
+    return PointTable(design.grid.ids(number), moved, covariance, campaign.area(truth))
+
+
+def _exact_points(design: CampaignDesign, number: Numbers, truth: Array, area: Ids) -> PointTable:
+    return PointTable(design.grid.ids(number), truth, np.broadcast_to(np.zeros((3, 3)), (len(number), 3, 3)), area)
+
+
+def _first_drawn(design: CampaignDesign, number: Numbers, count: int) -> Numbers:
+    """So many of some points, drawn by their names: whatever order they come in, it is the same ones."""
+    return number[np.argsort(keyed_uniform(design.seed, "check", number), kind="stable")[:count]]
 
 
 def _default_and_others(priors: Mapping[str, APriori]) -> tuple[APriori, dict[str, APriori]]:

@@ -288,7 +288,17 @@ simply("no point at most", lambda w: ["query", w.fused, *BOX, "--max-points", 0]
 simply("unknown blocking of an import", lambda w: [*w.importing(), "--blocks", "strip"])
 simply("sigma of an import out of range", lambda w: [*w.isis(), "--sigma", 0])
 simply("scale of a simulation out of range", lambda w: ["simulate", "region", "--out", w.new, "--scale", 0])
+simply("scale of a simulated China out of range", lambda w: ["simulate", "china", "--out", w.new, "--scale", 0])
+simply("unknown kind of error of a simulated China", lambda w: ["simulate", "china", "--out", w.new, "--error", "none"])
+simply("unknown region of simulated footprints", lambda w: ["simulate", "footprints", "--out", w.new, "--region", "mars"])
 simply("negative seed of a simulation", lambda w: ["simulate", "five-blocks", "--out", w.new, "--seed", -1])
+
+
+@case("shared data of a simulation not there")
+def _(w: World) -> list[Any]:
+    w.around = lambda: mock.patch.dict("os.environ", {"SUBMIN_DATA": str(w.folder)})
+    return ["simulate", "china", "--out", w.new]
+
 
 # --- the network ------------------------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ import pytest
 from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
 
-from orchestration.executors import DaskExecutor, SerialExecutor, executor_for
+from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, executor_for
 from submin.errors import ClusterError, InputError
 from submin.simulation.region import simulate_region
 from submin.storage.simulated import write_region
@@ -50,6 +50,25 @@ def test_results_come_in_order_from_both(cluster: LocalCluster) -> None:
             again = executor.submit_all(double, [(handle,) for handle in first], "again", lambda: None)
             assert executor.results(again) == [4 * k for k in range(20)]
             assert len(steps) == 20
+
+
+def test_a_stream_comes_in_order_and_is_bounded(cluster: LocalCluster) -> None:
+    with Client(cluster) as client:
+        for executor, most in ((SerialExecutor(), 1), (DaskExecutor(client), STREAMED * 2)):
+            asked: list[int] = []
+            arguments = ((asked.append(k) or executor.share(k),) for k in range(40))
+            taken = []
+            for value in executor.stream(double, arguments, "stream"):
+                taken.append(value)
+                assert len(asked) <= len(taken) - 1 + most
+            assert taken == [2 * k for k in range(40)]
+
+
+def test_an_error_in_a_stream_is_the_callers(cluster: LocalCluster) -> None:
+    with Client(cluster) as client:
+        for executor in (SerialExecutor(), DaskExecutor(client)):
+            with pytest.raises(InputError, match="value 0 is not wanted"):
+                list(executor.stream(fail, [(0,), (1,)], "fail"))
 
 
 def test_tasks_in_flight_are_bounded(cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,6 +104,27 @@ def test_blocks_of_different_models_share_a_pass() -> None:
     assert by_hand[6 * 6, 6 * 6 + 3] == 0.0
 
 
+@pytest.mark.parametrize("model", MODELS, ids=[m.correlation for m in MODELS])
+def test_images_of_a_block_may_have_pixels_of_their_own(model: APriori) -> None:
+    in_metres = replace(model, bias_m=15.0)
+    priors = [replace(image, a_priori=in_metres.in_pixels((2.1, 3.5)[k % 2])) for k, image in enumerate(images(3, 4, model))]
+    assert {image.a_priori.bias_px for image in priors if image.a_priori} == {7.14, 4.29}
+    assert_equal_covariances(covariance(priors), covariance_by_hand(priors))
+
+
+def test_a_shift_in_metres_is_metres_until_it_is_in_pixels() -> None:
+    stated = APriori(bias_m=15.0, drift_px=0.5)
+    bias, drift = RPC.parameters[0], RPC.parameters[1]
+    assert (stated.of(bias).sigma, stated.of(drift).sigma) == (15.0, 0.5)
+    found = stated.in_pixels(2.5)
+    assert (found.of(bias).sigma, found.of(drift).sigma, found.bias_m) == (6.0, 0.5, None)
+    assert APriori().in_pixels(2.5) == APriori()
+    assert APriori.from_mapping(stated.to_mapping()) == stated
+    assert "bias_m" not in APriori().to_mapping()
+    with pytest.raises(InputError, match=r"bias_m is 0.0; expected a positive number of metres"):
+        APriori(bias_m=0.0)
+
+
 def test_order_of_images_is_free() -> None:
     priors = images(blocks=3, each=3)
     order = np.random.default_rng(1).permutation(len(priors))

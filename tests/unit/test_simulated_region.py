@@ -14,7 +14,8 @@ from submin.adjustment.priors import APriori
 from submin.errors import InputError
 from submin.geodesy import WGS84, geocentric_to_geodetic, geodetic_to_geocentric
 from submin.sensors import Ground, sensor_named
-from submin.simulation.region import LinearArrayCamera, RegionDesign, RegionFrame, SimulatedRegion, simulate_region, terrain_height
+from submin.simulation.linear_array import LinearArrayCamera
+from submin.simulation.region import RegionDesign, RegionFrame, SimulatedRegion, simulate_region, terrain_height
 from submin.storage.catalogue import Catalogue, defects
 from submin.storage.simulated import quadrants, write_region
 

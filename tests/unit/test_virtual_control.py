@@ -19,7 +19,8 @@ from submin.adjustment.symmetric import fill_symmetric
 from submin.adjustment.virtual_control import VirtualControl, VirtuallyControlled, adjust_virtually, virtual_control, virtual_factor
 from submin.errors import InputError
 from submin.geodesy import geodetic_to_geocentric, local_axes
-from submin.simulation.region import SENSOR, RegionDesign, SimulatedRegion, simulate_region
+from submin.simulation.linear_array import SENSOR
+from submin.simulation.region import RegionDesign, SimulatedRegion, simulate_region
 
 Array = NDArray[np.float64]
 DESIGN = RegionDesign(
