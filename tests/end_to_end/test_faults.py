@@ -11,10 +11,13 @@ from contextlib import nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 
+import crashing_block
 import icechunk
+import numpy as np
 import psutil
 import pytest
 import shapely
+from networks import rewrite, same_network
 
 from benchmarks.faults import (
     KINDS,
@@ -91,6 +94,37 @@ def test_a_stopped_run_says_how_to_go_on(
     with scene.run(network, f"{name}-again", "--workers", 0) as again:
         assert again.wait() == 0, again.err
     assert undisturbed[0].faults(Content.of(network)) == []
+
+
+def test_a_block_that_crashes_its_worker_each_time_is_rejected(
+    scene: Scene, undisturbed: tuple[Content, float], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:  # fmt: skip
+    """The fourth of six, in the second batch, where it shares its task with the third. Once it crashes no more it comes in."""
+    blocks = list(Catalogue.open(scene.catalogue).blocks())
+    bad = blocks[3].block_id
+    network = scene.network("crash")
+    with monkeypatch.context() as environment:
+        environment.setenv(crashing_block.CRASHES, bad)
+        environment.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", crashing_block.__file__)
+        environment.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "1")
+        with scene.run(network, "crash") as command:
+            assert command.wait() == 1, command.err
+            assert command.err == ""
+            said = json.loads(command.out)
+    reason = (
+        "its adjustment killed 2 workers, one after the other; give workers more memory, or look into their logs for what crashes"
+    )
+    assert said["blocks_fused"] == 5
+    assert said["blocks_rejected"] == [{"block_id": bad, "reason": reason}]
+    lines = Snapshot.open(str(network)).ledger(["block_id", "status", "reason"])
+    assert [tuple(str(lines[name][k]) for name in lines) for k in np.flatnonzero(lines["block_id"] == bad)] == [(bad, "rejected", reason)]
+    without = scene.network("crash-without")
+    run(Catalogue.open(rewrite(scene.catalogue, tmp_path / "without", blocks[:3] + blocks[4:])), str(without), SerialExecutor())
+    same_network(network, without)
+    with scene.run(network, "crash-no-more", "--workers", 0) as command:
+        assert command.wait() == 0, command.err
+    assert undisturbed[0].faults(Content.of(network)) == ["another ledger"]  # with the rejection
+    same_network(network, scene.folder / "undisturbed")
 
 
 def test_ctrl_c_while_the_program_loads_is_one_line_too(scene: Scene) -> None:
