@@ -140,7 +140,7 @@ class Scene:
         """A new copy of the empty network."""
         return Path(shutil.copytree(self.empty, self.folder / name))
 
-    def run(self, network: Path, name: str, *where: object) -> Command:
+    def run(self, network: Path | str, name: str, *where: object) -> Command:
         """``submin run``, started; on a local cluster unless told where."""
         return submin_command(
             "run", self.catalogue, network, "--batch-blocks", self.batch_blocks, "--json", *(where or ("--workers", self.workers)),
@@ -166,7 +166,7 @@ class Content:
     control: ControlSet
 
     @classmethod
-    def of(cls, network: Path) -> Content:
+    def of(cls, network: Path | str) -> Content:
         """Of the newest version."""
         opened = submin.open(network)
         snapshot, rays = opened.snapshot, []
