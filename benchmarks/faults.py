@@ -47,9 +47,15 @@ SUBMIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler
 EVERYWHERE = (-180.0, -90.0, 180.0, 90.0)
 LONGEST = 120.0
 """Seconds after which a run counts as hanging."""
+LONGEST_COMMIT = 0.02
+"""Seconds that a small commit takes at most, from the first list of what it holds to the new version."""
 IDENTICAL = "identical"
 """Verdict on a trial without faults."""
-KINDS = ("one worker", "all workers", "coordinator", "scheduler")
+STAGES = ("adjust", "update-tile", "factor-tile")
+"""Tasks of a run, by the names that the cluster gives them."""
+IN_STAGE, IN_COMMIT, AFTER_COMMIT = "worker in ", "coordinator in a commit", "coordinator after a commit"
+KINDS = ("one worker", "all workers", *(IN_STAGE + stage for stage in STAGES), "coordinator", IN_COMMIT, AFTER_COMMIT, "scheduler")
+"""What is killed: workers and coordinators at the moment given, in a stage the worker that is busy with a task of it next."""
 Moment = Callable[["Command", Path], None]
 """Waits until it is time to kill; it is given the running command and its network."""
 
@@ -223,6 +229,8 @@ def _reading(place: str, version: str | None = None) -> tuple[str, str]:
     if control.version != network.version:
         raise ValueError(f"asked {network.version}, answered by {control.version}")
     lines = network.snapshot.ledger(["block_id", "version"])
+    if sorted(control.blocks) != sorted(lines["block_id"].tolist()):
+        raise ValueError(f"{network.version} answers from blocks that are not those of its ledger")
     if int(lines["version"].max(initial=0)) != network.snapshot.number:
         raise ValueError(f"the ledger of {network.version} ends with version {lines['version'].max(initial=0)}")
     digest = hashlib.sha256("\n".join([*control.ids.tolist(), *control.blocks, *lines["block_id"].tolist()]).encode())
@@ -359,7 +367,7 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
     with ExitStack() as stack:
         reader = stack.enter_context(Reader(network))
         where: tuple[object, ...] = ()
-        if kind == "scheduler":
+        if outside := kind == "scheduler" or kind.startswith(IN_STAGE):
             port = free_port()
             where = ("--scheduler", f"tcp://127.0.0.1:{port}")
             scheduler, _ = stack.enter_context(cluster(scene, name, port))
@@ -367,14 +375,17 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
         wait_until(lambda: begun(network), first)
         began = time.monotonic()
         moment(first, network)
+        busy = busy_worker(str(where[1]), kind.removeprefix(IN_STAGE), first) if kind.startswith(IN_STAGE) else None
         if first.process.poll() is not None:
             raise TooLate
-        workers = first.workers()
+        workers = [] if outside else first.workers()
         passed = time.monotonic() - began
-        if kind == "coordinator":
+        if kind.startswith("coordinator"):
             first.process.kill()
         elif kind == "scheduler":
             scheduler.process.kill()
+        elif busy is not None:
+            os.kill(busy, signal.SIGKILL)
         else:
             for worker in workers if kind == "all workers" else [rng.choice(workers)]:
                 worker.kill()
@@ -382,7 +393,7 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
         found = Snapshot.open(str(network))
         complete = len(found.ledger(["block_id"])["block_id"]) == len(undisturbed.ledger)
         code = first.wait()
-        if kind == "coordinator":
+        if kind.startswith("coordinator"):
             _, alive = psutil.wait_procs(workers, timeout=10)
             if alive:
                 faults.append(f"{len(alive)} workers outlived their coordinator")
@@ -400,11 +411,11 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
             seconds = time.monotonic() - killed
         again = stack.enter_context(scene.run(network, f"{name}-again", *where))
         code = again.wait()
-        if kind in ("coordinator", "scheduler"):
+        if kind == "scheduler" or kind.startswith("coordinator"):
             seconds = time.monotonic() - killed
         if code != 0 or again.err:
             faults.append(f"the same command again: exit code {code}: {again.err}")
-        elif kind in ("one worker", "all workers") and json.loads(again.out)["blocks_fused"]:
+        elif "worker" in kind and json.loads(again.out)["blocks_fused"]:
             faults.append("the run had ended before it was complete")
         readings = reader.ended()
     content = Content.of(network)
@@ -412,6 +423,26 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
     faults += undisturbed.faults(content) + [f"reader: {fault}" for fault in readings.faults]
     shutil.rmtree(network)
     return Trial(kind, passed, found.version, seconds, coordinates, covariance, readings, tuple(faults))
+
+
+def busy_worker(address: str, stage: str, command: Command) -> int:
+    """Process of the worker that is busy with a task of a stage; waits for one.
+
+    Raises
+    ------
+    TooLate
+        When the command ends before.
+    """
+    from distributed import Client
+
+    with Client(address, timeout="60s") as client:
+        processes = client.run(os.getpid)
+        while command.process.poll() is None:
+            for worker, keys in client.processing().items():
+                if any(str(key).startswith(f"{stage}-") for key in keys):
+                    return int(processes[worker])
+            time.sleep(0.001)
+    raise TooLate
 
 
 def begun(network: Path) -> bool:
@@ -423,6 +454,19 @@ def begun(network: Path) -> bool:
 def after_commit(number: int) -> Moment:
     """The moment when a version is there."""
     return lambda command, network: wait_until(lambda: Snapshot.open(str(network)).number >= number, command)
+
+
+def in_commit(number: int, seconds: float) -> Moment:
+    """So many seconds after the commit of the version after this one has begun: it lists what was written before it names the version."""
+
+    def wait(command: Command, network: Path) -> None:
+        after_commit(number)(command, network)
+        before = len(list((network / "manifests").iterdir()))
+        while len(list((network / "manifests").iterdir())) == before and command.process.poll() is None:
+            pass
+        time.sleep(seconds)
+
+    return wait
 
 
 def undisturbed_run(scene: Scene) -> tuple[Content, float]:
@@ -442,22 +486,32 @@ def after(seconds: float) -> Moment:
     return lambda command, network: time.sleep(seconds)
 
 
+def drawn(kind: str, batches: int, seconds: float, rng: random.Random) -> Moment:
+    """A random moment of a run of so many batches and seconds that suits what is killed."""
+    if kind == IN_COMMIT:
+        return in_commit(rng.randrange(batches), rng.uniform(0.0, LONGEST_COMMIT))
+    if kind == AFTER_COMMIT:
+        return after_commit(rng.randint(1, batches - 1))
+    return after(rng.uniform(0.0, seconds))
+
+
 def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None) -> list[dict[str, Any]]:
-    """Rows of kill, moment, what was found, and the differences; at scale 1 the region is 120 km x 120 km, 12 blocks in 4 batches."""
+    """Rows of kill, moment, what was found, and the differences; at scale 1 the region is 120 km x 120 km, 12 blocks in 6 batches."""
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     rng, say = random.Random(seed), Console(stderr=True, highlight=False)
     say.print(f"moments drawn with --seed {seed}")
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
-        scene = make_scene(Path(folder), 120.0 * scale**0.5, 3, max(workers, 1))
+        scene = make_scene(Path(folder), 120.0 * scale**0.5, 2, max(workers, 1))
         undisturbed, seconds = undisturbed_run(scene)
         say.print(f"undisturbed: {seconds:.1f} s, {len(undisturbed.ledger)} blocks, {len(undisturbed.control):,} points")
+        batches = -(-len(undisturbed.ledger) // scene.batch_blocks)
         while len(rows) < kills:
-            kind, moment = KINDS[len(rows) % len(KINDS)], rng.uniform(0.0, seconds)
+            kind, name = KINDS[len(rows) % len(KINDS)], f"kill-{len(rows) + 1}"
             try:
-                done = trial(scene, undisturbed, kind, after(moment), f"kill-{len(rows) + 1}", rng)
+                done = trial(scene, undisturbed, kind, drawn(kind, batches, seconds, rng), name, rng)
             except TooLate:
-                shutil.rmtree(scene.folder / f"kill-{len(rows) + 1}")
+                shutil.rmtree(scene.folder / name)
                 continue
             rows.append({"kill": len(rows) + 1, **done.to_row()})
             say.print(", ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in rows[-1].values()), soft_wrap=True)

@@ -61,3 +61,12 @@ def unreachable(place: str, reason: str) -> StoreError:
     return StoreError(
         f"{place}: cannot be reached ({reason}); check the bucket, AWS_ENDPOINT_URL, AWS_REGION and the credentials (docs/cluster.md)"
     )
+
+
+def unreadable(error: Exception) -> StoreError | None:
+    """What Icechunk raised while a network was read, as an error of ours; None for any other error."""
+    if not isinstance(error, icechunk.IcechunkError):
+        return None
+    return StoreError(
+        f"the network cannot be read ({reason_of(error)}); where its store answers, 'submin verify' tells what of it is damaged"
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import time
 from contextlib import nullcontext
@@ -20,6 +21,7 @@ import shapely
 from networks import rewrite, same_network
 
 from benchmarks.faults import (
+    EVERYWHERE,
     KINDS,
     Content,
     Scene,
@@ -29,6 +31,7 @@ from benchmarks.faults import (
     cluster,
     free_port,
     make_scene,
+    submin_command,
     trial,
     undisturbed_run,
     wait_until,
@@ -200,6 +203,17 @@ def test_a_lost_scheduler_is_said_whatever_is_asked_next(scene: Scene) -> None:
             ):  # fmt: skip
                 with pytest.raises(ClusterError, match=f"the Dask scheduler at tcp://127.0.0.1:{port} was lost; start a cluster"):
                     ask()
+
+
+def test_a_store_that_lost_a_file_is_one_line(scene: Scene, undisturbed: tuple[Content, float], tmp_path: Path) -> None:
+    network = Path(shutil.copytree(scene.folder / "undisturbed", tmp_path / "network"))
+    for chunk in (network / "chunks").iterdir():
+        chunk.unlink()
+    with submin_command("query", network, "--bbox", *EVERYWHERE, log=tmp_path / "query") as command:
+        assert command.wait() == 2
+        assert command.err.startswith("submin: the network cannot be read (")
+        assert command.err.endswith("); where its store answers, 'submin verify' tells what of it is damaged\n")
+        assert command.err.count("\n") == 1
 
 
 def test_the_lock_file_is_no_network_and_disturbs_none(scene: Scene, tmp_path: Path) -> None:

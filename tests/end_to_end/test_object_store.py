@@ -6,6 +6,7 @@ import json
 import socket
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import boto3
@@ -34,15 +35,21 @@ def listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of a service with an empty bucket, in a process of its own."""
+@contextmanager
+def serving(log: Path) -> Iterator[tuple[Command, str]]:
+    """A service with an empty bucket in a process of its own, and its address."""
     port = free_port()
     endpoint = f"http://127.0.0.1:{port}"
-    with Command(["-m", "moto.server", "-H", "127.0.0.1", "-p", port], tmp_path_factory.mktemp("service") / "service") as server:
+    with Command(["-m", "moto.server", "-H", "127.0.0.1", "-p", port], log) as server:
         wait_until(lambda: listens(port), server)
         keys = {name.lower(): value for name, value in KEYS.items()}
         boto3.client("s3", endpoint_url=endpoint, region_name="us-east-1", **keys).create_bucket(Bucket=BUCKET)
+        yield server, endpoint
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with serving(tmp_path_factory.mktemp("service") / "service") as (_, endpoint):
         yield endpoint
 
 
@@ -175,3 +182,19 @@ def test_what_cannot_be_reached_is_one_line(bucket: str, scene: Scene, call: Cal
         environment.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")
         code, _, err = call("info", place)
         assert (code, err) == (2, f"submin: {place}: cannot be reached (Connection refused (os error 111)); {hint}\n")
+
+
+def test_a_service_lost_in_the_middle_of_a_run_is_one_line(
+    bucket: str, scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:  # fmt: skip
+    with serving(tmp_path / "service") as (server, endpoint):
+        monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+        place = created(scene, f"{bucket}/lost")
+        with scene.run(place, "lost") as command:
+            wait_until(lambda: Snapshot.open(place).number >= 1, command)
+            server.process.kill()
+            assert command.wait() == 2
+            assert command.err == (
+                f"submin: {place}: cannot be written (Connection refused (os error 111)); nothing of this change is in the network: "
+                "check the service and the credentials, and give the same command again\n"
+            )
