@@ -114,11 +114,12 @@ def test_every_step_of_a_networks_life(bucket: str, scene: Scene, in_folder: Con
         assert json.loads(command.out)["blocks_fused"] == len(catalogue.block_ids)
     assert in_folder.faults(Content.of(place)) == []
     assert call("query", place, "--bbox", *EVERYWHERE, "--policy", "rigorous", "--out", tmp_path / "control.npz")[0] == 0
+    sigma = np.sqrt(np.diag(in_folder.control.covariance))
     spread = np.load(tmp_path / "control.npz")["covariance"] - in_folder.control.covariance
-    assert (np.abs(spread) / in_folder.sigma / in_folder.sigma[:, None]).max() <= 1e-9
+    assert (np.abs(spread) / sigma / sigma[:, None]).max() <= 1e-9
     assert call("withdraw", place, "--block", block)[0] == 0
     assert call("tag", place, "without")[0] == 0
-    assert [(v.name, v.tags) for v in versions(place)][0] == ("v4", ("without",))
+    assert versions(place)[0].tags == ("without",)
     assert call("verify", place)[0] == 0
     assert call("history", place)[0] == 0
 
