@@ -44,7 +44,7 @@ ROOT = Path(__file__).parents[1]
 # a signal that the caller ignores (a job in the background) would be ignored by the command too
 SUBMIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from orchestration.cli import main; main()"
 EVERYWHERE = (-180.0, -90.0, 180.0, 90.0)
-LONGEST = 120.0
+LONGEST = 300.0
 """Seconds after which a run counts as hanging."""
 LONGEST_COMMIT = 0.02
 """Seconds that a small commit takes at most, from the first list of what it holds to the new version."""
