@@ -18,6 +18,7 @@ from orchestration.cli import main
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import SerialExecutor
 from orchestration.progress import Silent
+from orchestration.reconcile import reconcile
 from orchestration.run import run
 from orchestration.withdraw import withdraw
 from submin.errors import ConflictError
@@ -77,6 +78,7 @@ def in_folder(scene: Scene) -> Content:
     """The network that a run leaves in a folder."""
     network = scene.network("folder")
     run(Catalogue.open(scene.catalogue), str(network), SerialExecutor(), batch_blocks=2)
+    reconcile(str(network), SerialExecutor())
     return Content.of(network)
 
 
@@ -126,6 +128,7 @@ def test_every_step_of_a_networks_life(bucket: str, scene: Scene, in_folder: Con
     folder = scene.network("also-without")
     run(catalogue, str(folder), SerialExecutor(), batch_blocks=2)
     withdraw(str(folder), SerialExecutor(), block=block)
+    reconcile(str(folder), SerialExecutor())
     expected, found = Content.of(folder), Content.of(place)
     assert (expected.ledger, expected.rays) == (found.ledger, found.rays)
     assert max(expected.differences(found)) <= 1e-9
@@ -144,7 +147,7 @@ def test_workers_write_to_the_bucket(bucket: str, scene: Scene, in_folder: Conte
     else:
         with scene.run(place, name) as command:
             assert command.wait() == 0, command.err
-    assert Snapshot.open(place).version == "v3"
+    assert Snapshot.open(place).version == "v4"  # three batches, and the reconciliation
     assert in_folder.faults(Content.of(place)) == []
 
 
@@ -160,7 +163,7 @@ def test_of_two_writers_the_later_commit_is_refused(bucket: str, scene: Scene, i
 
     with pytest.raises(ConflictError, match="another run committed to this network meanwhile; nothing of this batch was written"):
         run(catalogue, place, SerialExecutor(), batch_blocks=2, reporter=AnotherRun())
-    assert [v.name for v in versions(place)] == ["v3", "v2", "v1", "v0"]
+    assert [v.name for v in versions(place)] == ["v4", "v3", "v2", "v1", "v0"]
     assert in_folder.faults(Content.of(place)) == []
     assert run(catalogue, place, SerialExecutor()).fused == 0
 
