@@ -269,7 +269,7 @@ def _read_all_the_time(place: str, stop: Event) -> Readings:
             faults.add(f"{type(error).__name__}: {error}")
             if stop.is_set():
                 break
-        time.sleep(max(time.monotonic() - started, 0.02))  # half of a processor is for the run
+        time.sleep(max(2.0 * (time.monotonic() - started), 0.02))  # most of a processor is for the run
     for version, given in seen.items():
         if given != {_reading(place, version)[1]}:
             faults.add(f"{version} gave other answers than it does at rest: {sorted(given)}")
@@ -326,7 +326,7 @@ class Reader:
 
 @dataclass(frozen=True)
 class Standing:
-    """What serves one trial after the other: the address of a cluster's scheduler, and a reader."""
+    """What serves one trial after the other: the address of a cluster's scheduler, if there is one, and a reader."""
 
     address: str
     reader: Reader
@@ -405,8 +405,8 @@ def trial(
     with ExitStack() as stack:
         read = stack.enter_context((standing.reader if standing else stack.enter_context(Reader())).reading(network))
         where: tuple[object, ...] = ()
-        if outside := kind in ("scheduler", IN_COMMIT, AFTER_COMMIT) or kind.startswith(IN_STAGE):
-            if standing is not None and kind != "scheduler":
+        if outside := scene.workers > 0 and (kind in ("scheduler", IN_COMMIT, AFTER_COMMIT) or kind.startswith(IN_STAGE)):
+            if standing is not None and standing.address and kind != "scheduler":
                 address = standing.address
             else:
                 port = free_port()
@@ -552,22 +552,26 @@ def drawn(kind: str, batches: int, seconds: float, rng: random.Random) -> Moment
 
 
 def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None) -> list[dict[str, Any]]:
-    """Rows of kill, moment, what was found, and the differences; at scale 1 the region is 120 km x 120 km, 12 blocks in 6 batches."""
+    """Rows of kill, moment, what was found, and the differences; at scale 1 the region is 120 km x 120 km, 12 blocks in 6 batches.
+
+    Without workers runs are of one process, the coordinator, and that is killed.
+    """
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     rng, say = random.Random(seed), Console(stderr=True, highlight=False)
     say.print(f"moments drawn with --seed {seed}")
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        scene = make_scene(Path(folder), 120.0 * scale**0.5, 2, max(workers, 1))
+        scene = make_scene(Path(folder), 120.0 * scale**0.5, 2, workers)
         undisturbed, seconds = undisturbed_run(scene)
         say.print(f"undisturbed: {seconds:.1f} s, {len(undisturbed.ledger)} blocks, {len(undisturbed.control):,} points")
         batches = -(-len(undisturbed.ledger) // scene.batch_blocks)
-        port = free_port()
-        stack.enter_context(cluster(scene, "cluster", port))
-        standing = Standing(f"tcp://127.0.0.1:{port}", stack.enter_context(Reader()))
+        port, kinds = free_port(), KINDS if workers else ("coordinator", IN_COMMIT, AFTER_COMMIT)
+        if workers:
+            stack.enter_context(cluster(scene, "cluster", port))
+        standing = Standing(f"tcp://127.0.0.1:{port}" if workers else "", stack.enter_context(Reader()))
         stack.enter_context(suppress(KeyboardInterrupt))  # ends with the rows so far
         while len(rows) < kills:
-            kind, name = KINDS[len(rows) % len(KINDS)], f"kill-{len(rows) + 1}"
+            kind, name = kinds[len(rows) % len(kinds)], f"kill-{len(rows) + 1}"
             try:
                 moment = drawn(kind, batches, seconds, rng)
                 done = trial(scene, undisturbed, kind, moment, name, rng, standing)
