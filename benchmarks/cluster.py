@@ -19,7 +19,7 @@ import zarr
 
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import Executor, executor_for
-from orchestration.reconcile import reconcile
+from orchestration.reconcile import ReconcileResult, reconcile
 from orchestration.run import run
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.arrays import append_table, group_of, write_record
@@ -90,7 +90,10 @@ def _run(place: Path, scale: float, executor: Executor) -> tuple[str, Rows]:
     before = _bytes(place / "network")
     rows.append(_count("images that tiles see", images / tiles, "images a tile", tiles))
     rows += [_count(f"{part} of a run", size / tiles, "bytes a tile", tiles) for part, size in before.items()]
-    rows.append(_row("coordinator of a reconciliation", tiles, "tiles", _seconds(lambda: reconcile(network, executor))))
+    reconciled: list[ReconcileResult] = []
+    seconds = _seconds(lambda: reconciled.append(reconcile(network, executor)))
+    rows.append(_row("coordinator of a reconciliation", tiles, "tiles", seconds))
+    rows.append(_count("largest front", reconciled[0].largest_front, "vectors", tiles))
     after = _bytes(place / "network")
     rows += [_count(f"{part} of a reconciliation", (size - before[part]) / tiles, "bytes a tile", tiles) for part, size in after.items()]
     return network, rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import zarr
@@ -139,7 +140,8 @@ def _stage_one(
     """
     of_images = [block for block in blocks if block.kind == "images"]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
-    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid, _gate(group, base)) for group in groups]
+    gates = _gates(groups, base)
+    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid, gate) for group, gate in zip(groups, gates, strict=True)]
     outcomes = executor.attempt_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
     for k, outcome in enumerate(outcomes):
         if isinstance(outcome, KilledTaskError):
@@ -173,16 +175,15 @@ def _one_at_a_time(blocks: Sequence[BlockRays], ellipsoid: Ellipsoid, gate: Gate
     return done
 
 
-def _gate(blocks: Sequence[Block], base: Snapshot) -> Gate | None:
-    """What some blocks are tested by; None for a network without images."""
-    if not base.image_count():
-        return None
-    ids = [np.unique(block.point_ids) for block in blocks]
-    cells = np.split(base.candidate_cells(np.concatenate(ids)), np.cumsum([len(of_block) for of_block in ids])[:-1])
-    if not any((of_block >= 0).any() for of_block in cells):
-        return None
+def _gates(groups: Sequence[Sequence[Block]], base: Snapshot) -> list[Gate | None]:
+    """What the blocks of each group are tested by; None where the network has none of their points. The directory is read once."""
+    if not base.image_count() or not groups:
+        return [None] * len(groups)
     shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
-    return Gate(shared, tuple(cells))
+    of_blocks = [np.unique(block.point_ids) for block in chain(*groups)]
+    cells = iter(np.split(base.candidate_cells(np.concatenate(of_blocks)), np.cumsum([len(ids) for ids in of_blocks])[:-1]))
+    of_groups = [tuple(next(cells) for _ in group) for group in groups]
+    return [Gate(shared, of_group) if any((cell >= 0).any() for cell in of_group) else None for of_group in of_groups]
 
 
 def _tested(test: BlockTest | None, version: int) -> tuple[float, int, float, int, int]:

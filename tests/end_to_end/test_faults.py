@@ -126,9 +126,7 @@ def test_a_block_that_crashes_its_worker_each_time_is_rejected(
             assert command.wait() == 1, command.err
             assert command.err == ""
             said = json.loads(command.out)
-    reason = (
-        "its adjustment killed 2 workers, one after the other; give workers more memory, or look into their logs for what crashes"
-    )
+    reason = "its adjustment killed 2 workers, one after the other; give workers more memory, or look into their logs for what crashes"
     assert said["blocks_fused"] == 5
     assert said["blocks_rejected"] == [{"block_id": bad, "reason": reason}]
     lines = Snapshot.open(str(network)).ledger(["block_id", "status", "reason"])
