@@ -12,8 +12,8 @@ from submin.sensors import SURVEYS
 from submin.storage.accuracy_map import accuracy_of_all
 from submin.storage.dense_reader import DenseReader
 from submin.storage.ledger import Ledger
-from submin.storage.reconciled import ReconciledStore
 from submin.storage.place import is_remote
+from submin.storage.reconciled import ReconciledStore
 
 
 def describe(network: Network) -> dict[str, Any]:
