@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import correlation, dense_update, faults, five_blocks, main_job, stage_one, sub_min, worldview
+from benchmarks import cluster, correlation, dense_update, faults, five_blocks, main_job, stage_one, sub_min, worldview
 from benchmarks.comparison import DATA, MET
 from benchmarks.machine import machine
 from orchestration.text_tables import as_wide_as
@@ -24,6 +24,7 @@ BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "dense-update": ("a dense network's update in the time of BLAS's own; a thousand updates lose no digits", dense_update.measure),
     "sub-min": ("memory of a sub-MIN, a batch on one thread, low-rank update against factorisation, drift", sub_min.measure),
     "faults": ("a run whose processes are killed leaves the network of an undisturbed one", faults.measure),
+    "cluster": ("what a run costs beside its tasks: scheduler, coordinator and store", cluster.measure),
     "five-blocks": ("Tables 2 and 3 of the 2008 paper; sequential = simultaneous; consistent", five_blocks.measure),
     "correlation": ("correlation functions in place of a covariance: factor of consistency and storage, by family", correlation.measure),
     "worldview": ("Tables 3 to 6 of the 2010 paper; pair = cell = simultaneous; time a pair", worldview.measure),

@@ -20,9 +20,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -37,7 +36,7 @@ from orchestration.create import create, fit_catalogue
 from submin.query.control_set import ControlSet
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot
+from submin.storage.network_store import Snapshot, versions
 from submin.storage.simulated import write_region
 from submin.storage.writer_lock import LOCK_FILE
 
@@ -45,11 +44,21 @@ ROOT = Path(__file__).parents[1]
 # a signal that the caller ignores (a job in the background) would be ignored by the command too
 SUBMIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from orchestration.cli import main; main()"
 EVERYWHERE = (-180.0, -90.0, 180.0, 90.0)
-LONGEST = 120.0
+LONGEST = 300.0
 """Seconds after which a run counts as hanging."""
+LONGEST_COMMIT = 0.02
+"""Seconds that a small commit takes at most, from the first list of what it holds to the new version."""
 IDENTICAL = "identical"
 """Verdict on a trial without faults."""
-KINDS = ("one worker", "all workers", "coordinator", "scheduler")
+STAGES = ("adjust", "update-tile", "factor-tile", "collect-tile", "distribute-tile")
+"""Tasks of a run, by the names that the cluster gives them."""
+IN_STAGE, IN_COMMIT, AFTER_COMMIT = "worker in ", "coordinator in a commit", "coordinator after a commit"
+KINDS = ("one worker", "all workers", *(IN_STAGE + stage for stage in STAGES), "coordinator", IN_COMMIT, AFTER_COMMIT, "scheduler")
+"""What is killed. At the moment given, but in a stage the worker that is next busy with a task of it.
+
+Runs whose scheduler is killed, whose worker is killed in a stage, or whose coordinator is killed at a commit, are on a cluster of processes
+that were started by Dask's own commands; the others on a local one.
+"""
 Moment = Callable[["Command", Path], None]
 """Waits until it is time to kill; it is given the running command and its network."""
 
@@ -140,7 +149,7 @@ class Scene:
         """A new copy of the empty network."""
         return Path(shutil.copytree(self.empty, self.folder / name))
 
-    def run(self, network: Path, name: str, *where: object) -> Command:
+    def run(self, network: Path | str, name: str, *where: object) -> Command:
         """``submin run``, started; on a local cluster unless told where."""
         return submin_command(
             "run", self.catalogue, network, "--batch-blocks", self.batch_blocks, "--json", *(where or ("--workers", self.workers)),
@@ -159,14 +168,15 @@ def make_scene(folder: Path, side_km: float, batch_blocks: int, workers: int) ->
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What two networks are compared by: ledger, rays, and the rigorous answer for all points."""
+    """What two networks are compared by: ledger, rays, the rigorous answer for all points, and what each tile answers alone."""
 
     ledger: tuple[tuple[object, ...], ...]
     rays: tuple[tuple[str, str, bool], ...]
     control: ControlSet
+    tiles: tuple[ControlSet, ...]
 
     @classmethod
-    def of(cls, network: Path) -> Content:
+    def of(cls, network: Path | str) -> Content:
         """Of the newest version."""
         opened = submin.open(network)
         snapshot, rays = opened.snapshot, []
@@ -178,12 +188,8 @@ class Content:
         # rays_rejected is a block's count at its own version, before later blocks
         table = snapshot.ledger(["block_id", "content", "status", "images", "rays"])
         ledger = zip(*(column.tolist() for column in table.values()), strict=True)
-        return cls(tuple(sorted(ledger)), tuple(sorted(rays)), opened.query(bbox=EVERYWHERE, policy="rigorous"))
-
-    @cached_property
-    def sigma(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """Standard deviation of every coordinate, metres."""
-        return np.sqrt(np.diag(self.control.covariance))
+        tiles = tuple(opened.query(tile=snapshot.cover.tile_name(tile)) for tile in snapshot.tile_numbers())
+        return cls(tuple(sorted(ledger)), tuple(sorted(rays)), opened.query(bbox=EVERYWHERE, policy="rigorous"), tiles)
 
     def faults(self, other: Content) -> list[str]:
         """What is wrong with another network that should be the same."""
@@ -192,19 +198,30 @@ class Content:
             found.append("another ledger")
         if self.rays != other.rays or len({row[:2] for row in other.rays}) < len(other.rays):
             found.append("other rays")
-        if self.control.ids.tolist() != other.control.ids.tolist():
+        differences = self.differences(other)
+        if np.isnan(differences).any():
             found.append("other points")
-        elif not max(self.differences(other)) <= 1e-9:
+        elif not max(differences) <= 1e-9:
             found.append("another answer")
         return found
 
     def differences(self, other: Content) -> tuple[float, float]:
         """Largest difference of coordinates, in standard deviations, and of the covariance, as a correlation. NaN: other points."""
-        if self.control.ids.tolist() != other.control.ids.tolist():
+        if len(self.tiles) != len(other.tiles):
             return np.nan, np.nan
-        moved = np.abs(self.control.geocentric - other.control.geocentric).ravel() / self.sigma
-        spread = np.abs(self.control.covariance - other.control.covariance) / self.sigma / self.sigma[:, None]
-        return float(moved.max()), float(spread.max())
+        pairs = zip((self.control, *self.tiles), (other.control, *other.tiles), strict=True)
+        moved, spread = np.array([differences(one, another) for one, another in pairs]).max(axis=0)  # which keeps NaN
+        return float(moved), float(spread)
+
+
+def differences(one: ControlSet, other: ControlSet) -> tuple[float, float]:
+    """As `Content.differences`, of two answers."""
+    if one.ids.tolist() != other.ids.tolist():
+        return np.nan, np.nan
+    sigma = np.sqrt(np.diag(one.covariance))
+    moved = np.abs(one.geocentric - other.geocentric).ravel() / sigma
+    spread = np.abs(one.covariance - other.covariance) / sigma / sigma[:, None]
+    return float(moved.max(initial=0.0)), float(spread.max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -223,7 +240,10 @@ def _reading(place: str, version: str | None = None) -> tuple[str, str]:
     if control.version != network.version:
         raise ValueError(f"asked {network.version}, answered by {control.version}")
     lines = network.snapshot.ledger(["block_id", "version"])
-    if int(lines["version"].max(initial=0)) != network.snapshot.number:
+    if sorted(control.blocks) != sorted(lines["block_id"].tolist()):
+        raise ValueError(f"{network.version} answers from blocks that are not those of its ledger")
+    fused = max((v.number for v in versions(place) if v.number <= network.snapshot.number and "fused" in v.message), default=0)
+    if int(lines["version"].max(initial=0)) != fused:
         raise ValueError(f"the ledger of {network.version} ends with version {lines['version'].max(initial=0)}")
     digest = hashlib.sha256("\n".join([*control.ids.tolist(), *control.blocks, *lines["block_id"].tolist()]).encode())
     digest.update(control.geocentric.tobytes())
@@ -231,8 +251,8 @@ def _reading(place: str, version: str | None = None) -> tuple[str, str]:
     return network.version, f"{len(control)} points, {digest.hexdigest()}"
 
 
-def _read_all_the_time(place: str, stop: Event, report: Connection) -> None:
-    """Body of the reader process. In the end it asks every version that it saw once more, at rest: each answer must have been that one."""
+def _read_all_the_time(place: str, stop: Event) -> Readings:
+    """Query until told to stop. In the end every version that was seen is asked once more, at rest: each answer must have been that one."""
     seen: dict[str, set[str]] = {}
     answers, last, faults = 0, -1, set()
     while not (stop.is_set() and answers):
@@ -249,21 +269,27 @@ def _read_all_the_time(place: str, stop: Event, report: Connection) -> None:
             faults.add(f"{type(error).__name__}: {error}")
             if stop.is_set():
                 break
-        time.sleep(max(time.monotonic() - started, 0.02))  # half of a processor is for the run
+        time.sleep(max(2.0 * (time.monotonic() - started), 0.02))  # most of a processor is for the run
     for version, given in seen.items():
         if given != {_reading(place, version)[1]}:
             faults.add(f"{version} gave other answers than it does at rest: {sorted(given)}")
-    report.send(Readings(answers, tuple(seen), tuple(sorted(faults))))
+    return Readings(answers, tuple(seen), tuple(sorted(faults)))
+
+
+def _serve(stop: Event, connection: Connection) -> None:
+    """Body of the reader process: one network after the other."""
+    while True:
+        connection.send(_read_all_the_time(connection.recv(), stop))
 
 
 class Reader:
     """A process that opens and queries a network all the time."""
 
-    def __init__(self, network: Path) -> None:
+    def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._stop = context.Event()
-        self._report, theirs = context.Pipe(duplex=False)
-        self._process = context.Process(target=_read_all_the_time, args=(str(network), self._stop, theirs), daemon=True)
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(self._stop, theirs), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -271,21 +297,39 @@ class Reader:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, if `ended` has not."""
-        if self._process.is_alive():
-            self._process.terminate()
+        """End the process."""
+        self._process.terminate()
         self._process.join()
-        self._report.close()
+        self._connection.close()
 
-    def ended(self) -> Readings:
-        """Stop reading, and what was read."""
-        self._stop.set()
+    @contextmanager
+    def reading(self, network: Path) -> Iterator[Callable[[], Readings]]:
+        """Read a network while the body runs; what is given ends the reading, and says what was read."""
+        readings: list[Readings] = []
+
+        def ended() -> Readings:
+            if not readings:
+                self._stop.set()
+                try:
+                    readings.append(self._connection.recv())
+                except EOFError:
+                    readings.append(Readings(0, (), ("the reader has died",)))
+            return readings[0]
+
+        self._stop.clear()
+        self._connection.send(str(network))
         try:
-            readings: Readings = self._report.recv()
-        except EOFError:
-            return Readings(0, (), ("the reader has died",))
-        self._process.join()
-        return readings
+            yield ended
+        finally:
+            ended()
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What serves one trial after the other: the address of a cluster's scheduler, if there is one, and a reader."""
+
+    address: str
+    reader: Reader
 
 
 @dataclass(frozen=True)
@@ -347,7 +391,9 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: str, rng: random.Random) -> Trial:
+def trial(
+    scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: str, rng: random.Random, standing: Standing | None = None
+) -> Trial:  # fmt: skip
     """Kill processes of a run, give the same command again, and compare.
 
     Raises
@@ -357,24 +403,31 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
     """
     network, faults = scene.network(name), []
     with ExitStack() as stack:
-        reader = stack.enter_context(Reader(network))
+        read = stack.enter_context((standing.reader if standing else stack.enter_context(Reader())).reading(network))
         where: tuple[object, ...] = ()
-        if kind == "scheduler":
-            port = free_port()
-            where = ("--scheduler", f"tcp://127.0.0.1:{port}")
-            scheduler, _ = stack.enter_context(cluster(scene, name, port))
+        if outside := scene.workers > 0 and (kind in ("scheduler", IN_COMMIT, AFTER_COMMIT) or kind.startswith(IN_STAGE)):
+            if standing is not None and standing.address and kind != "scheduler":
+                address = standing.address
+            else:
+                port = free_port()
+                address = f"tcp://127.0.0.1:{port}"
+                scheduler, _ = stack.enter_context(cluster(scene, name, port))
+            where = ("--scheduler", address)
         first = stack.enter_context(scene.run(network, f"{name}-first", *where))
         wait_until(lambda: begun(network), first)
         began = time.monotonic()
         moment(first, network)
+        busy = busy_worker(str(where[1]), kind.removeprefix(IN_STAGE), first) if kind.startswith(IN_STAGE) else None
         if first.process.poll() is not None:
             raise TooLate
-        workers = first.workers()
+        workers = [] if outside else first.workers()
         passed = time.monotonic() - began
-        if kind == "coordinator":
+        if kind.startswith("coordinator"):
             first.process.kill()
         elif kind == "scheduler":
             scheduler.process.kill()
+        elif busy is not None:
+            os.kill(busy, signal.SIGKILL)
         else:
             for worker in workers if kind == "all workers" else [rng.choice(workers)]:
                 worker.kill()
@@ -382,7 +435,7 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
         found = Snapshot.open(str(network))
         complete = len(found.ledger(["block_id"])["block_id"]) == len(undisturbed.ledger)
         code = first.wait()
-        if kind == "coordinator":
+        if kind.startswith("coordinator"):
             _, alive = psutil.wait_procs(workers, timeout=10)
             if alive:
                 faults.append(f"{len(alive)} workers outlived their coordinator")
@@ -400,18 +453,38 @@ def trial(scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: s
             seconds = time.monotonic() - killed
         again = stack.enter_context(scene.run(network, f"{name}-again", *where))
         code = again.wait()
-        if kind in ("coordinator", "scheduler"):
+        if kind == "scheduler" or kind.startswith("coordinator"):
             seconds = time.monotonic() - killed
         if code != 0 or again.err:
             faults.append(f"the same command again: exit code {code}: {again.err}")
-        elif kind in ("one worker", "all workers") and json.loads(again.out)["blocks_fused"]:
+        elif "worker" in kind and json.loads(again.out)["blocks_fused"]:
             faults.append("the run had ended before it was complete")
-        readings = reader.ended()
+        readings = read()
     content = Content.of(network)
     coordinates, covariance = undisturbed.differences(content)
     faults += undisturbed.faults(content) + [f"reader: {fault}" for fault in readings.faults]
     shutil.rmtree(network)
     return Trial(kind, passed, found.version, seconds, coordinates, covariance, readings, tuple(faults))
+
+
+def busy_worker(address: str, stage: str, command: Command) -> int:
+    """Process of the worker that is busy with a task of a stage; waits for one.
+
+    Raises
+    ------
+    TooLate
+        When the command ends before.
+    """
+    from distributed import Client
+
+    with Client(address, timeout="60s") as client:
+        processes = client.run(os.getpid)
+        while command.process.poll() is None:
+            for worker, keys in client.processing().items():
+                if any(str(key).startswith(f"{stage}-") for key in keys):
+                    return int(processes[worker])
+            time.sleep(0.001)
+    raise TooLate
 
 
 def begun(network: Path) -> bool:
@@ -422,17 +495,44 @@ def begun(network: Path) -> bool:
 
 def after_commit(number: int) -> Moment:
     """The moment when a version is there."""
-    return lambda command, network: wait_until(lambda: Snapshot.open(str(network)).number >= number, command)
+
+    def wait(command: Command, network: Path) -> None:
+        seen = 0
+
+        def there() -> bool:
+            nonlocal seen
+            last, seen = seen, (network / "refs" / "branch.main" / "ref.json").stat().st_mtime_ns
+            return seen != last and Snapshot.open(str(network)).number >= number
+
+        wait_until(there, command)
+
+    return wait
+
+
+def in_commit(number: int, seconds: float) -> Moment:
+    """So many seconds after the commit of the version after this one has begun: it lists what was written before it names the version."""
+
+    def wait(command: Command, network: Path) -> None:
+        after_commit(number)(command, network)
+        before = lists(network)
+        while lists(network) == before and command.process.poll() is None:
+            pass
+        time.sleep(seconds)
+
+    def lists(network: Path) -> int:
+        return sum(1 for _ in (network / "manifests").glob("*"))
+
+    return wait
 
 
 def undisturbed_run(scene: Scene) -> tuple[Content, float]:
     """The network that every trial must leave, and the seconds of its run, with a reader as in the trials."""
     network = scene.network("undisturbed")
-    with Reader(network) as reader, scene.run(network, "undisturbed-run") as command:
+    with Reader() as reader, reader.reading(network) as read, scene.run(network, "undisturbed-run") as command:
         if command.wait() != 0:
             raise RuntimeError(command.err)
         seconds = float(json.loads(command.out)["seconds"])
-        if faults := reader.ended().faults:
+        if faults := read().faults:
             raise RuntimeError(f"the reader of an undisturbed run: {faults}")
     return Content.of(network), seconds
 
@@ -442,22 +542,41 @@ def after(seconds: float) -> Moment:
     return lambda command, network: time.sleep(seconds)
 
 
+def drawn(kind: str, batches: int, seconds: float, rng: random.Random) -> Moment:
+    """A random moment of a run of so many batches and seconds that suits what is killed."""
+    if kind == IN_COMMIT:
+        return in_commit(rng.randrange(batches), rng.uniform(0.0, LONGEST_COMMIT))
+    if kind == AFTER_COMMIT:
+        return after_commit(rng.randint(1, batches - 1))
+    return after(rng.uniform(0.0, seconds))
+
+
 def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None) -> list[dict[str, Any]]:
-    """Rows of kill, moment, what was found, and the differences; at scale 1 the region is 120 km x 120 km, 12 blocks in 4 batches."""
+    """Rows of kill, moment, what was found, and the differences; at scale 1 the region is 120 km x 120 km, 12 blocks in 6 batches.
+
+    Without workers runs are of one process, the coordinator, and that is killed.
+    """
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     rng, say = random.Random(seed), Console(stderr=True, highlight=False)
     say.print(f"moments drawn with --seed {seed}")
     rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        scene = make_scene(Path(folder), 120.0 * scale**0.5, 3, max(workers, 1))
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        scene = make_scene(Path(folder), 120.0 * scale**0.5, 2, workers)
         undisturbed, seconds = undisturbed_run(scene)
         say.print(f"undisturbed: {seconds:.1f} s, {len(undisturbed.ledger)} blocks, {len(undisturbed.control):,} points")
+        batches = -(-len(undisturbed.ledger) // scene.batch_blocks)
+        port, kinds = free_port(), KINDS if workers else ("coordinator", IN_COMMIT, AFTER_COMMIT)
+        if workers:
+            stack.enter_context(cluster(scene, "cluster", port))
+        standing = Standing(f"tcp://127.0.0.1:{port}" if workers else "", stack.enter_context(Reader()))
+        stack.enter_context(suppress(KeyboardInterrupt))  # ends with the rows so far
         while len(rows) < kills:
-            kind, moment = KINDS[len(rows) % len(KINDS)], rng.uniform(0.0, seconds)
+            kind, name = kinds[len(rows) % len(kinds)], f"kill-{len(rows) + 1}"
             try:
-                done = trial(scene, undisturbed, kind, after(moment), f"kill-{len(rows) + 1}", rng)
+                moment = drawn(kind, batches, seconds, rng)
+                done = trial(scene, undisturbed, kind, moment, name, rng, standing)
             except TooLate:
-                shutil.rmtree(scene.folder / f"kill-{len(rows) + 1}")
+                shutil.rmtree(scene.folder / name)
                 continue
             rows.append({"kill": len(rows) + 1, **done.to_row()})
             say.print(", ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in rows[-1].values()), soft_wrap=True)

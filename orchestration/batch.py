@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import zarr
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 from orchestration.change import Move, finish, place, settle, take_points
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
-from orchestration.tasks import BlockRays, FlaggedImage, Gate, adjust_blocks
+from orchestration.tasks import BlockAdjustment, BlockRays, FlaggedImage, Gate, adjust_blocks
 from submin.adjustment.surveyed_points import ContradictedPoint
-from submin.geodesy import geocentric_to_geodetic
+from submin.errors import KilledTaskError
+from submin.geodesy import Ellipsoid, geocentric_to_geodetic
 from submin.network.innovation import REJECTED, BlockTest
 from submin.network.registration import LooseRays, together
 from submin.storage.block_images import network_images
@@ -138,11 +140,15 @@ def _stage_one(
     """
     of_images = [block for block in blocks if block.kind == "images"]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
-    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid, _gate(group, base)) for group in groups]
-    handles = executor.submit_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
+    gates = _gates(groups, base)
+    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid, gate) for group, gate in zip(groups, gates, strict=True)]
+    outcomes = executor.attempt_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
+    for k, outcome in enumerate(outcomes):
+        if isinstance(outcome, KilledTaskError):
+            outcomes[k] = _one_at_a_time(*arguments[k], executor)
     accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if b.kind != "images"}
     tests: dict[str, BlockTest] = {}
-    for outcome in (outcome for group in executor.results(handles) for outcome in group):
+    for outcome in (outcome for group in outcomes for outcome in group):
         reason = outcome.reason or disagreement(outcome.accepted)
         if reason is None and outcome.test is not None:
             tests[outcome.block_id] = outcome.test
@@ -153,16 +159,31 @@ def _stage_one(
     return accepted, tests
 
 
-def _gate(blocks: Sequence[Block], base: Snapshot) -> Gate | None:
-    """What some blocks are tested by; None for a network without images."""
-    if not base.image_count():
-        return None
-    ids = [np.unique(block.point_ids) for block in blocks]
-    cells = np.split(base.candidate_cells(np.concatenate(ids)), np.cumsum([len(of_block) for of_block in ids])[:-1])
-    if not any((of_block >= 0).any() for of_block in cells):
-        return None
+def _one_at_a_time(blocks: Sequence[BlockRays], ellipsoid: Ellipsoid, gate: Gate | None, executor: Executor) -> list[BlockAdjustment]:
+    """Stage 1 of blocks whose task killed its workers, each with nothing beside it: what kills them then is that block."""
+    done = []
+    for k, block in enumerate(blocks):
+        alone = None if gate is None else Gate(gate.snapshot, gate.cells[k : k + 1])
+        (outcome,) = executor.attempt_all(adjust_blocks, [([block], ellipsoid, alone)], "adjust", lambda: None)
+        if isinstance(outcome, KilledTaskError):
+            reason = (
+                f"its adjustment killed {outcome.workers} workers, one after the other; give workers more memory, "
+                "or look into their logs for what crashes"
+            )
+            outcome = [BlockAdjustment(block.block_id, np.zeros(len(block.image), dtype=np.bool_), reason)]
+        done.extend(outcome)
+    return done
+
+
+def _gates(groups: Sequence[Sequence[Block]], base: Snapshot) -> list[Gate | None]:
+    """What the blocks of each group are tested by; None where the network has none of their points. The directory is read once."""
+    if not base.image_count() or not groups:
+        return [None] * len(groups)
     shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
-    return Gate(shared, tuple(cells))
+    of_blocks = [np.unique(block.point_ids) for block in chain(*groups)]
+    cells = iter(np.split(base.candidate_cells(np.concatenate(of_blocks)), np.cumsum([len(ids) for ids in of_blocks])[:-1]))
+    of_groups = [tuple(next(cells) for _ in group) for group in groups]
+    return [Gate(shared, of_group) if any((cell >= 0).any() for cell in of_group) else None for of_group in of_groups]
 
 
 def _tested(test: BlockTest | None, version: int) -> tuple[float, int, float, int, int]:

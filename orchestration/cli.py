@@ -39,6 +39,13 @@ def main() -> None:
                 sys.exit(app(prog_name="submin", standalone_mode=False))
             except (SubminError, OSError, USAGE_ERROR) as error:
                 _fail(" ".join(_message(error).split()), 2)
+            except Exception as error:
+                from submin.storage.place import unreadable
+
+                said = unreadable(error)
+                if said is None:
+                    raise
+                _fail(" ".join(str(said).split()), 2)
     except Stopped as stopped:
         _fail(str(stopped), stopped.exit_code)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from submin.adjustment.warm_up import compile_kernels
-from submin.errors import ClusterError, InputError
+from submin.errors import ClusterError, InputError, KilledTaskError
 
 SHARED_VALUES_GO_WITH_TASKS = {"distributed.admin.large-graph-warning-threshold": "1GB"}
 """Dask would warn at 10 MB and ask to scatter; `DaskExecutor.share` says why not."""
@@ -47,6 +47,13 @@ class Executor(Protocol):
 
     def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
         """The values of a function for tuples of arguments, in their order, a bounded number of them at a time: none is kept."""
+        ...
+
+    def attempt_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
+        """As `submit_all`, but the values; that of a task whose workers were killed again and again is the `KilledTaskError`.
+
+        Such a task need not be to blame: it may have waited on the worker of another one that is.
+        """
         ...
 
     def results(self, handles: Sequence[Any]) -> list[Any]:
@@ -97,6 +104,10 @@ class SerialExecutor:
         """See `Executor.stream`."""
         return (function(*args) for args in arguments)
 
+    def attempt_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
+        """See `Executor.attempt_all`. Nothing outlives a crash here."""
+        return self.submit_all(function, arguments, name, advance)
+
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""
         return list(handles)
@@ -123,7 +134,21 @@ class DaskExecutor:
 
     def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
         """See `Executor.submit_all`."""
-        from distributed import as_completed
+        return self._run(function, arguments, name, advance, past_kills=False)
+
+    def attempt_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
+        """See `Executor.attempt_all`."""
+        handles = self._run(function, arguments, name, advance, past_kills=True)
+        try:
+            return self.results(handles)
+        except KilledTaskError:
+            return [self._attempt(handle) for handle in handles]
+
+    def _run(
+        self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance, *, past_kills: bool
+    ) -> list[Any]:
+        """Handles of all tasks, done; of those that killed their workers too where the run goes past them."""
+        from distributed import KilledWorker, as_completed
 
         waiting = iter(range(len(arguments)))
         handles: list[Any] = [None] * len(arguments)
@@ -141,7 +166,7 @@ class DaskExecutor:
             first = [f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None]
             running: Any = as_completed(first)
             for future in running:
-                if future.status != "finished":
+                if future.status != "finished" and not (past_kills and isinstance(future.exception(), KilledWorker)):
                     future.result()  # raises the task's error here
                 advance()
                 following = submit_next()
@@ -180,6 +205,12 @@ class DaskExecutor:
             while waiting:
                 yield waiting.popleft().result()
 
+    def _attempt(self, handle: Any) -> Any:
+        try:
+            return self.results([handle])[0]
+        except KilledTaskError as error:
+            return error
+
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""
         with self._losses_said():
@@ -203,11 +234,7 @@ class DaskExecutor:
         try:
             yield
         except KilledWorker as error:
-            task = str(error.task).rpartition("-")[0]
-            raise ClusterError(
-                f"{error.allowed_failures + 1} workers that ran the same task ({task}) were killed, as happens where memory is short",
-                "give the same command again, with fewer workers or fewer --batch-blocks",
-            ) from None
+            raise KilledTaskError(str(error.task).rpartition("-")[0], error.allowed_failures + 1) from None
         except (CancelledError, CommClosedError, ClosedClientError):
             raise self._lost() from None
         except OSError:

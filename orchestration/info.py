@@ -12,6 +12,7 @@ from submin.sensors import SURVEYS
 from submin.storage.accuracy_map import accuracy_of_all
 from submin.storage.dense_reader import DenseReader
 from submin.storage.ledger import Ledger
+from submin.storage.place import is_remote
 from submin.storage.reconciled import ReconciledStore
 
 
@@ -90,4 +91,4 @@ def _describe_dense(network: Network, dense: DenseReader) -> dict[str, Any]:
 
 def _size(place: str) -> int:
     """Bytes of a network in a folder; -1 where it is none."""
-    return sum(f.stat().st_size for f in Path(place).rglob("*") if f.is_file()) if "://" not in place else -1
+    return sum(f.stat().st_size for f in Path(place).rglob("*") if f.is_file()) if not is_remote(place) else -1

@@ -26,11 +26,22 @@ class BusyError(StoreError):
 
 
 class ClusterError(SubminError):
-    """The processes that compute were lost: the scheduler, or the same task's workers again and again."""
+    """The processes that compute were lost: the scheduler, or workers."""
 
     def __init__(self, problem: str, remedy: str) -> None:
         super().__init__(f"{problem}; {remedy}")
         self.problem, self.remedy = problem, remedy
+
+
+class KilledTaskError(ClusterError):
+    """The workers that ran a task were killed, one after the other."""
+
+    def __init__(self, task: str, workers: int) -> None:
+        super().__init__(
+            f"{workers} workers that ran the same task ({task}) were killed, as happens where memory is short",
+            "give the same command again, with fewer workers or fewer --batch-blocks",
+        )
+        self.task, self.workers = task, workers
 
 
 class NumericalError(SubminError):

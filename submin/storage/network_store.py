@@ -25,6 +25,7 @@ from submin.network.cell import Cell, empty_cell, empty_sums, widened_sums
 from submin.network.network_image import NetworkImage, image_priors
 from submin.network.sub_min import SubMin
 from submin.storage.arrays import attributes_of, create_table, group_of, hash_ids, read_record, read_table, table_length
+from submin.storage.place import is_remote, reason_of, storage_of, unreachable
 from submin.storage.schema import (
     CHANGE_COLUMNS,
     DIRECTORY_COLUMNS,
@@ -46,6 +47,8 @@ _FIRST_FORMAT: dict[str, Any] = {"spec_version": 1} if "spec_version" in signatu
 """Icechunk 2 (which needs Python 3.12) reads and writes both formats, Icechunk 1 only the first: networks must travel."""
 _TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
 READ_OVER_ROWS = 256
+_ABSENT = "no such network; make one with 'submin create'"
+_TAKEN = "already exists; choose another place, or remove it first"
 
 
 @dataclass(frozen=True)
@@ -64,30 +67,19 @@ class Version:
         return f"v{self.number}"
 
 
-def _storage(place: str) -> icechunk.Storage:
-    if place.startswith("s3://"):
-        bucket, _, prefix = place.removeprefix("s3://").partition("/")
-        return icechunk.s3_storage(bucket=bucket, prefix=prefix or None, from_env=True)
-    return icechunk.local_filesystem_storage(place)
-
-
 def _open_repository(place: str) -> icechunk.Repository:
-    if "://" not in place and Path(place).is_file():
+    if not is_remote(place) and Path(place).is_file():
         raise StoreError(f"{place}: is a file; expected the folder of a network: make one with 'submin create'")
-    if "://" not in place and not Path(place).is_dir():
-        raise StoreError(f"{place}: no such network; make one with 'submin create'")
+    if not is_remote(place) and not Path(place).is_dir():
+        raise StoreError(f"{place}: {_ABSENT}")
     try:
-        return icechunk.Repository.open(_storage(place))
+        return icechunk.Repository.open(storage_of(place))
     except icechunk.IcechunkError as error:
-        raise StoreError(f"{place}: not a network ({_reason(error)}); make one with 'submin create'") from None
-
-
-def _reason(error: Exception) -> str:
-    """The innermost cause: Icechunk tells causes a line each, from the outside in."""
-    if isinstance(error, OSError):
-        return error.strerror or str(error)
-    lines = [line.strip(" │├╰─|`->") for line in str(error).splitlines()]
-    return next((line for line in reversed(lines) if line), type(error).__name__)
+        if not is_remote(place):
+            raise StoreError(f"{place}: not a network ({reason_of(error)}); make one with 'submin create'") from None
+        if "repository doesn't exist" in str(error):
+            raise StoreError(f"{place}: {_ABSENT}") from None
+        raise unreachable(place, reason_of(error)) from None
 
 
 def create_network(place: str, metadata: NetworkMetadata, begin: Callable[[zarr.Group], None] | None = None) -> Version:
@@ -98,16 +90,16 @@ def create_network(place: str, metadata: NetworkMetadata, begin: Callable[[zarr.
     StoreError
         When something is already there or the place cannot be written.
     """
-    if "://" not in place and Path(place).exists() and (not Path(place).is_dir() or any(Path(place).iterdir())):
-        raise StoreError(f"{place}: already exists; choose another place, or remove it first")
-    remote, folder = "://" in place, Path(place)
+    if not is_remote(place) and Path(place).exists() and (not Path(place).is_dir() or any(Path(place).iterdir())):
+        raise StoreError(f"{place}: {_TAKEN}")
+    remote, folder = is_remote(place), Path(place)
     # made beside the folder that is meant, or in it where it exists (it may be a mount), and moved there when all is written
     beside = folder if folder.is_dir() else folder.absolute().parent
     making = place if remote else str(beside / f".{uuid4().hex}")
     try:
         if not remote:  # Icechunk panics where it cannot make the folder
             Path(making).mkdir(parents=True)
-        session = icechunk.Repository.create(_storage(making), **_FIRST_FORMAT).writable_session(BRANCH)
+        session = icechunk.Repository.create(storage_of(making), **_FIRST_FORMAT).writable_session(BRANCH)
         root = zarr.create_group(session.store, attributes=metadata.to_attributes() | {"version": 0})
         root.create_group("cells")
         root.create_group("tiles")
@@ -128,8 +120,11 @@ def create_network(place: str, metadata: NetworkMetadata, begin: Callable[[zarr.
         elif not remote:
             Path(making).rename(folder)
     except (icechunk.IcechunkError, OSError) as error:
+        if remote:
+            taken = "clean prefix" in str(error)
+            raise (StoreError(f"{place}: {_TAKEN}") if taken else unreachable(place, reason_of(error))) from error
         raise StoreError(
-            f"{place}: cannot be written ({_reason(error)}); make room there, mend the permissions, or choose another place"
+            f"{place}: cannot be written ({reason_of(error)}); make room there, mend the permissions, or choose another place"
         ) from error
     finally:
         if not remote:
@@ -364,12 +359,13 @@ def clear_write_errors(place: str) -> Iterator[None]:
     try:
         yield
     except icechunk.IcechunkError as error:
-        raise write_error(place, _reason(error)) from error
+        raise write_error(place, reason_of(error)) from error
 
 
 def write_error(place: str, reason: str) -> StoreError:
     """The error that says that a change could not be written, and why."""
     return StoreError(
         f"{place}: cannot be written ({reason}); nothing of this change is in the network: "
-        "make room or mend the permissions, and give the same command again"
+        f"{'check the service and the credentials' if is_remote(place) else 'make room or mend the permissions'}, "
+        "and give the same command again"
     )

@@ -20,6 +20,7 @@ from typing import BinaryIO
 
 from submin.errors import BusyError, StoreError
 from submin.storage.network_store import Snapshot, clear_write_errors, write_error
+from submin.storage.place import is_remote
 
 LOCK_FILE = "writer.lock"
 NO_LOCKS_HERE = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
@@ -37,7 +38,7 @@ def writing(place: str) -> Iterator[None]:
     StoreError
         When there is no network, or it cannot be written; nothing is left behind then.
     """
-    if "://" in place:
+    if is_remote(place):
         with clear_write_errors(place):
             yield
         return

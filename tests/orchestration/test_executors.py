@@ -14,7 +14,7 @@ from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
 
 from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, executor_for
-from submin.errors import ClusterError, InputError
+from submin.errors import ClusterError, InputError, KilledTaskError
 from submin.simulation.region import simulate_region
 from submin.storage.simulated import write_region
 
@@ -34,6 +34,10 @@ def fail_to_write(value: int) -> int:
 def kill_the_worker(value: int) -> int:
     os.kill(os.getpid(), signal.SIGKILL)
     return value
+
+
+def kill_for_three(value: int) -> int:
+    return kill_the_worker(value) if value == 3 else double(value)
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +135,22 @@ def test_a_task_that_kills_its_workers_is_named() -> None:
     ):
         executor.submit_all(kill_the_worker, [(1,)], "update-tile", lambda: None)
     assert "\n" not in str(said.value)
+
+
+def test_past_a_task_that_kills_its_workers() -> None:
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), executor_for(1) as executor:
+        (killed,) = executor.attempt_all(kill_the_worker, [(1,)], "adjust", lambda: None)
+        assert isinstance(killed, KilledTaskError)
+        assert (killed.task, killed.workers) == ("adjust", 2)
+        steps: list[int] = []
+        outcomes = executor.attempt_all(kill_for_three, [(k,) for k in range(5)], "adjust", lambda: steps.append(1))
+        assert isinstance(outcomes[3], KilledTaskError)
+        # one that waited on the worker of another may be blamed too
+        assert all(outcome == 2 * k or isinstance(outcome, KilledTaskError) for k, outcome in enumerate(outcomes))
+        assert outcomes[0] == 0
+        assert len(steps) == 5
+        with pytest.raises(InputError, match="value 0 is not wanted"):
+            executor.attempt_all(fail, [(0,)], "fail", lambda: None)
 
 
 def test_an_input_or_output_error_of_a_task_is_no_lost_scheduler(cluster: LocalCluster) -> None:
