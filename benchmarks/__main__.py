@@ -13,7 +13,18 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import cluster, correlation, dense_update, faults, five_blocks, main_job, stage_one, sub_min, worldview
+from benchmarks import (
+    cluster,
+    continuity,
+    correlation,
+    dense_update,
+    faults,
+    five_blocks,
+    main_job,
+    stage_one,
+    sub_min,
+    worldview,
+)
 from benchmarks.comparison import DATA, MET
 from benchmarks.machine import machine
 from orchestration.text_tables import as_wide_as
@@ -26,11 +37,12 @@ BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "faults": ("a run whose processes are killed leaves the network of an undisturbed one", faults.measure),
     "cluster": ("what a run costs beside its tasks: scheduler, coordinator and store", cluster.measure),
     "five-blocks": ("Tables 2 and 3 of the 2008 paper; sequential = simultaneous; consistent", five_blocks.measure),
+    "continuity": ("what a tile border does to the result, by policy and overlap, against the monolithic network", continuity.measure),
     "correlation": ("correlation functions in place of a covariance: factor of consistency and storage, by family", correlation.measure),
     "worldview": ("Tables 3 to 6 of the 2010 paper; pair = cell = simultaneous; time a pair", worldview.measure),
 }
 
-WITH_FIGURES = ("five-blocks", "worldview", "correlation")
+WITH_FIGURES = ("five-blocks", "worldview", "correlation", "continuity")
 
 GOOD = (MET, DATA, faults.IDENTICAL, "")
 """Verdicts that ask for nothing; the paper's own lines have none."""
@@ -39,12 +51,15 @@ GOOD = (MET, DATA, faults.IDENTICAL, "")
 def command(
     name: Annotated[str | None, typer.Argument(help="Benchmark to run; without one they are listed.")] = None,
     scale: Annotated[
-        float, typer.Option(help="Part of the full size; five-blocks, worldview: of the realisations; correlation: of the region.")
+        float,
+        typer.Option(help="Part of the full size; five-blocks, worldview: of the realisations; continuity, correlation: of the area."),
     ] = 1.0,
     workers: Annotated[int, typer.Option(help="Worker processes.")] = 2,
     kills: Annotated[int | None, typer.Option(min=1, help="faults: number of kills.")] = None,
     seed: Annotated[int | None, typer.Option(help="faults: seed of the moments; default: drawn, and said.")] = None,
-    figures: Annotated[Path | None, typer.Option("--out", help="five-blocks, worldview, correlation: folder for figures.")] = None,
+    figures: Annotated[
+        Path | None, typer.Option("--out", help="five-blocks, worldview, correlation, continuity: folder for figures.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Run a benchmark and print it beside the machine that it ran on. Exit code 1 when something that is asked for is not met."""

@@ -36,6 +36,9 @@ def query(
     details: Annotated[
         bool, typer.Option("--details", help="Columns status, first_block, last_block, blocks, convergence and licences too.")
     ] = False,
+    join: Annotated[
+        Path | None, typer.Option("--join", help="Control from elsewhere, a query written as .parquet or .npz, that joins by ci.")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--out", help="File to write: .parquet, .npz (joint covariance), .geojson, .csv or .gcp.")
     ] = None,
@@ -48,6 +51,7 @@ def query(
     import submin
     from orchestration.create import read_area
     from orchestration.point_list import read_point_ids
+    from submin.errors import InputError
     from submin.storage.validity import read_date
 
     if max_points is not None:
@@ -55,17 +59,24 @@ def query(
     day = None if on is None else date.fromisoformat(read_date(on, "--on"))
     if output is None:
         check_applies({"--details": details or None}, "--out")
+    if join is not None and details:
+        raise InputError("--details says what this network knows of its points, and --join brings others; leave one of them out")
+    elsewhere = None if join is None else submin.read_control(join)
     started = time.monotonic()
     opened = submin.open(network, at)
     control = opened.query(
         bbox=bbox, area=None if aoi is None else read_area(aoi), points=None if points is None else read_point_ids(points),
         tile=tile, policy=policy, max_points=max_points, on=day,
     )  # fmt: skip
+    answered = control.policy
+    if elsewhere is not None:
+        control = control.joined(elsewhere)
     if output is not None:
         control.write(output, opened.points(points=control.ids).details() if details else {})
     seconds = time.monotonic() - started
     values = {
         "points": len(control), "policy": control.policy, "tiles": list(control.tiles), "version": control.version, "scope": control.scope,
+        "policy_asked": policy, "policy_of_network": answered, "joined": None if join is None else str(join),
         "blocks": len(control.blocks), "seconds": seconds, "out": None if output is None else str(output),
         "validity": list(control.validity),
     }  # fmt: skip
@@ -78,8 +89,10 @@ def query(
 
     values |= {"ce90_median": float(np.median(control.ce90)), "le90_median": float(np.median(control.le90))}
     shown = "" if output is None else f"; written to {output}"
-    show(values, as_json, f"{len(control):,} points of {network} {control.version}, policy {control.policy} over {len(control.tiles)} "
-         f"tile{'s' if len(control.tiles) > 1 else ''} (scope: {control.scope}), "
+    chosen = f"policy {answered}{' (chosen by auto)' if policy == 'auto' else ''}"
+    joined = "" if join is None else f", joined with {join} by ci"
+    show(values, as_json, f"{len(control):,} points of {network} {control.version}, {chosen} over {len(control.tiles)} "
+         f"tile{'s' if len(control.tiles) > 1 else ''}{joined} (scope: {control.scope}), "
          f"median CE90 {values['ce90_median']:.3g} m, LE90 {values['le90_median']:.3g} m, {seconds:.2f} s{shown}")  # fmt: skip
 
 

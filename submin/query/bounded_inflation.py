@@ -35,18 +35,22 @@ ROUND_OFF = 1e-9
 def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: Sequence[GroundPart]) -> SubMin:
     """A posteriori state of the images by bounded inflation; for a point asked for alone the tighter one of that and its own fusion."""
     padded = padded_tiles(source, tiles)
-    count = len(tiles)
-    bounds = np.eye(count)
-    for s, t in combinations(range(count), 2):
-        bounds[s, t] = bounds[t, s] = _bound(cross_information(padded, s, t))
-    functionals = padded.functionals(parts)
-    scale = inflation(padded.of_tiles, bounds, functionals)
+    scale = inflation(padded.of_tiles, correlation_bounds(padded), padded.functionals(parts))
     whole = padded.weighted(padded.holds @ (1.0 / scale), float((1.0 / scale).sum()))
-    if count == 1 or sum(len(part.origin) for part in parts) > 1:
+    if len(tiles) == 1 or sum(len(part.origin) for part in parts) > 1:
         return whole
     alone = _of_one_point(padded, parts)
     seen = loadings(parts, padded.rows, padded.images.parameters)
     return min(whole, alone, key=lambda state: float((seen @ state.covariance @ seen.T).trace()))
+
+
+def correlation_bounds(padded: PaddedTiles) -> Array:
+    """Bounds (t, t) of the canonical correlations of the tiles' estimates of all images."""
+    count = len(padded.factors)
+    bounds = np.eye(count)
+    for s, t in combinations(range(count), 2):
+        bounds[s, t] = bounds[t, s] = _bound(cross_information(padded, s, t))
+    return bounds
 
 
 def _bound(cross: Array) -> float:
@@ -91,24 +95,35 @@ def _of_one_point(padded: PaddedTiles, parts: Sequence[GroundPart]) -> SubMin:
 
     Fused on the images the point would be inflated for functionals that nobody asked for.
     """
+    seen, information, correlation = seen_point(padded, parts)
+    scale = inflation(information, correlation, np.eye(3))
+    covariance = la.inv(_symmetric(np.tensordot(1.0 / scale, information, axes=1)))
+    vector = padded.holds.T.astype(np.float64) @ padded.vector  # K' h_t of each tile
+    fused = covariance @ sum(information[t] @ (seen[t].T @ vector[t]) / scale[t] for t in range(len(scale)))
+    # u = G (U u) with U G = I: any state of the images that says this of the point, and of nothing else
+    gain = seen[0] @ information[0]
+    theta = np.asarray(padded.prior @ (gain @ fused)).reshape(len(padded.rows), -1)
+    spread = padded.prior @ gain
+    return SubMin(padded.rows, theta, np.asarray(spread @ covariance @ spread.T), float("nan"), 0)
+
+
+def seen_point(padded: PaddedTiles, parts: Sequence[GroundPart]) -> tuple[list[Array], Array, Array]:
+    """What the tiles say of the 3-vector ``U u`` of one point.
+
+    Returns
+    -------
+    ``M_t U'`` (q, 3) of each tile, the information (t, 3, 3) about the vector, and bounds (t, t) of the canonical correlations.
+    """
     loading = (loadings(parts, padded.rows, padded.images.parameters) @ padded.prior).toarray()
     count = len(padded.factors)
-    seen = [la.cho_solve((lower, True), loading.T) for lower in padded.factors]  # M_t U'
+    seen = [la.cho_solve((lower, True), loading.T) for lower in padded.factors]
     information = np.stack([la.inv(_symmetric(loading @ of_tile)) for of_tile in seen])
     roots = [la.cholesky(of_tile) for of_tile in information]  # upper R, R'R = (U M_t U')^-1
     correlation = np.eye(count)
     for s, t in combinations(range(count), 2):
         cross = roots[s] @ (seen[s].T @ padded.common(s, t) @ seen[t]) @ roots[t].T
         correlation[s, t] = correlation[t, s] = _bound(cross)
-    scale = inflation(information, correlation, np.eye(3))
-    covariance = la.inv(_symmetric(np.tensordot(1.0 / scale, information, axes=1)))
-    vector = padded.holds.T.astype(np.float64) @ padded.vector  # K' h_t of each tile
-    fused = covariance @ sum(information[t] @ (seen[t].T @ vector[t]) / scale[t] for t in range(count))
-    # u = G (U u) with U G = I: any state of the images that says this of the point, and of nothing else
-    gain = seen[0] @ information[0]
-    theta = np.asarray(padded.prior @ (gain @ fused)).reshape(len(padded.rows), -1)
-    spread = padded.prior @ gain
-    return SubMin(padded.rows, theta, np.asarray(spread @ covariance @ spread.T), float("nan"), 0)
+    return seen, information, correlation
 
 
 def _symmetric(matrix: Array) -> Array:

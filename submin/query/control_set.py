@@ -16,6 +16,7 @@ from submin.correlation.compact import AUTO, CompactCovariance, condense
 from submin.errors import InputError, QueryError
 from submin.formats import tables
 from submin.geodesy import Ellipsoid, common_axes, geocentric_to_geodetic, local_axes, rotate_covariance
+from submin.query.joined import PointSet, join
 
 Array = NDArray[np.float64]
 
@@ -191,6 +192,49 @@ class ControlSet:
             tile_of_point=self.tile_of_point[chosen],
             rays=self.rays[chosen],
             validity=tuple(dated for dated in self.validity if dated.rsplit(" ", 1)[0] in here),
+        )
+
+    def joined(self, other: ControlSet, policy: str = "ci") -> ControlSet:
+        """These points and those of a set that comes from elsewhere, as one: another network's answer, or a file (`submin.read_control`).
+
+        Nothing is known of what the two share, so the answer holds whatever it is: Covariance Intersection with the weight that is best for
+        all points of both. Points of the same id are the same points and bridge the sets; points that only one of them knows are
+        corrected through its joint covariance (docs/mathematics.md, "Sets from elsewhere").
+
+        Tiles, and the tile of a point, are those of this set; a point that it does not know has none. The rays of a common point are those
+        of the set that counts more: some may be the same.
+
+        Raises
+        ------
+        QueryError
+            When the policy is not ``ci``, frame, epoch or ellipsoid differ, or there is no common point.
+        NumericalError
+            When the covariances of the common points are not positive definite together.
+        """
+        if policy != "ci":
+            raise QueryError(
+                f"policy is {policy!r}; a set from elsewhere can join only by 'ci': it has no ledger of blocks, so what it shares with "
+                "this one is unknown, and every other policy needs to know"
+            )
+        for name, mine, theirs in (
+            ("frame", self.frame, other.frame), ("epoch", self.epoch, other.epoch), ("ellipsoid", self.ellipsoid, other.ellipsoid)
+        ):  # fmt: skip
+            if mine != theirs:
+                raise QueryError(f"{name} of the other set is {theirs}; expected {mine}, that of this one: transform its points first")
+        found = join(*(PointSet(c.ids, c.geocentric, c.covariance) for c in (self, other)))
+        here, there = found.place_one >= 0, found.place_other >= 0
+        counts = (np.where(here, self.rays[found.place_one], 0), np.where(there, other.rays[found.place_other], 0))
+        return replace(
+            self,
+            ids=found.points.ids,
+            geocentric=found.points.geocentric,
+            covariance=found.points.covariance,
+            policy="ci",
+            tile_of_point=np.where(here, self.tile_of_point[found.place_one], ""),
+            rays=np.maximum(*counts),
+            blocks=tuple(sorted({*self.blocks, *other.blocks})),
+            scope="tiles",
+            validity=tuple(sorted({*self.validity, *other.validity})),
         )
 
     def compact(self, family: str = AUTO, rank: int = 0, floor: float | None = None) -> CompactCovariance:

@@ -81,6 +81,20 @@ def test_the_main_job(shell: Shell, place: Path) -> None:
     control = np.load(place / "control.npz")
     assert control["covariance"].shape == (3 * asked["points"], 3 * asked["points"])
     np.linalg.cholesky(control["covariance"])
+    auto = ["query", network, "--bbox", 99, 34, 101, 36]
+    assert "policy rigorous (chosen by auto) over" in shell(*auto)[0]
+    chosen = shell.json(*auto)
+    assert (chosen["policy_asked"], chosen["policy"], chosen["tiles"]) == ("auto", "rigorous", asked["tiles"])
+    near = ["query", network, "--points", place / "near.txt"]
+    (place / "near.txt").write_text(str(control["ids"][0]))
+    assert "policy tile (chosen by auto) over 1 tile" in shell(*near)[0]
+    assert shell.json(*near)["policy"] == "tile"
+    joined = shell.json(*near, "--join", place / "control.npz", "--out", place / "joined.npz")
+    assert (joined["policy"], joined["policy_of_network"], joined["points"]) == ("ci", "tile", asked["points"])
+    both = np.load(place / "joined.npz")
+    np.testing.assert_array_equal(both["ids"], control["ids"])
+    assert np.trace(both["covariance"]) <= np.trace(control["covariance"]) * (1.0 + 1e-5)
+    assert f"joined with {place / 'control.npz'} by ci" in shell(*near, "--join", place / "control.npz")[0]
     for suffix in ("parquet", "geojson", "csv"):
         shell("query", network, "--tile", asked["tiles"][0], "--out", place / f"control.{suffix}")
         assert (place / f"control.{suffix}").stat().st_size > 1000

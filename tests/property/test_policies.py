@@ -27,6 +27,7 @@ from property.exact_covariance import (
     split,
     weighted_sum,
 )
+from property.random_information import random_functionals, random_information, trace_of
 from shapely.geometry.base import BaseGeometry
 
 import submin
@@ -324,22 +325,6 @@ def test_the_cross_covariance_keeps_the_order_of_the_ids(overlapping: Made) -> N
     np.testing.assert_allclose(overlapping.network.cross_covariance(*names[::-1], *ids[::-1]), one.T, rtol=0.0, atol=1e-9)
     with pytest.raises(QueryError, match=r"tile r000c000 does not hold 1 of 2 points.*elsewhere"):
         overlapping.network.cross_covariance(*names, ["elsewhere", str(ids[0][0])], ids[1])
-
-
-def random_information(rng: np.random.Generator, tiles: int, size: int) -> Array:
-    """Information of some estimates, each with the a priori I, that know different directions to very different precision."""
-    factors = rng.normal(size=(tiles, size, size)) * 10.0 ** rng.uniform(-3.0, 2.0, (tiles, size, 1))
-    factors *= rng.random((tiles, size, 1)) < 0.6
-    return np.asarray(np.eye(size) + np.swapaxes(factors, 1, 2) @ factors)
-
-
-def random_functionals(rng: np.random.Generator, size: int) -> Array:
-    seen = rng.normal(size=(int(rng.integers(1, 2 * size)), size))
-    return np.asarray(seen.T @ seen)
-
-
-def trace_of(weights: Array, information: Array, functionals: Array) -> float:
-    return float(np.trace(np.linalg.solve(np.tensordot(weights, information, axes=1), functionals)))
 
 
 @pytest.mark.parametrize("seed", range(40))
