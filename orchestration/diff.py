@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from submin import Network
 from submin.geodesy import geodetic_to_geocentric, local_axes
-from submin.storage.accuracy_map import accuracy_map
 
 Array = NDArray[np.float64]
 
@@ -70,7 +69,7 @@ class Difference:
 
 def difference(before: Network, after: Network) -> Difference:
     """Compare two versions of a network."""
-    a, b = accuracy_map(before), accuracy_map(after)
+    a, b = before.accuracy(), after.accuracy()
     ids, at_a, at_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     ellipsoid = after.cover.ellipsoid
     shift = geodetic_to_geocentric(b.geodetic[at_b], ellipsoid) - geodetic_to_geocentric(a.geodetic[at_a], ellipsoid)

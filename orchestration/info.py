@@ -14,6 +14,7 @@ from submin.storage.dense_reader import DenseReader
 from submin.storage.ledger import Ledger
 from submin.storage.place import is_remote
 from submin.storage.reconciled import ReconciledStore
+from submin.storage.validity import today
 
 
 def describe(network: Network) -> dict[str, Any]:
@@ -25,7 +26,7 @@ def describe(network: Network) -> dict[str, Any]:
     images = snapshot.image_columns(["image_id", "sensor", "released", "withdrawn"])
     here = (images["withdrawn"] == 0) & ~np.isin(images["sensor"], SURVEYS)
     ledger = Ledger.of(snapshot)
-    accuracy = accuracy_of_all(network)
+    accuracy = accuracy_of_all(network, today())
     reported = ~accuracy.thinned & ~accuracy.retired
     return {
         "version": network.version,

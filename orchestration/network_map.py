@@ -25,7 +25,7 @@ from submin import Network
 from submin.errors import InputError
 from submin.formats.replacing import replacing
 from submin.sensors import SURVEYS
-from submin.storage.accuracy_map import PointAccuracy, accuracy_map
+from submin.storage.accuracy_map import PointAccuracy
 from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
@@ -128,7 +128,7 @@ def draw_network(network: Network, path: str | Path, *, title: str | None = None
 
 def network_figure(network: Network, title: str | None = None) -> Figure:
     """The figure that `draw_network` writes, on a canvas of its own: nothing of matplotlib's global state is used."""
-    cover, points, images = network.cover, accuracy_map(network), _images(network)
+    cover, points, images = network.cover, network.accuracy(), _images(network)
     plane = np.column_stack(cover.plane(points.geodetic[:, 0], points.geodetic[:, 1])) if len(points) else np.empty((0, 2))
     view = _view(cover, plane)
     place = plane / view.metres

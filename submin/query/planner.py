@@ -97,10 +97,11 @@ def all_points(source: NetworkSource) -> list[Selection]:
     return [s for s in (Selection(cell, np.flatnonzero(_wanted(cell, every=False))) for cell in cells) if len(s.rows)]
 
 
-def points_of_tile(source: NetworkSource, number: int, every: bool = False) -> list[Selection]:
-    """All determined points that a tile holds; with ``every`` also those of fewer than two rays."""
+def points_of_tile(source: NetworkSource, number: int, every: bool = False, core: bool = False) -> list[Selection]:
+    """All determined points that a tile, or with ``core`` its core, holds; with ``every`` also those of fewer than two rays."""
     existing = set(source.cell_numbers())
-    cells = [source.cell(cell) for cell in source.cover.cells_held(number) if cell in existing]
+    held = source.cover.cells_owned(number) if core else source.cover.cells_held(number)
+    cells = [source.cell(cell) for cell in held if cell in existing]
     return [s for s in (Selection(cell, np.flatnonzero(_wanted(cell, every))) for cell in cells) if len(s.rows)]
 
 

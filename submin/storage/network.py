@@ -37,6 +37,7 @@ from submin.query.planner import (
     well_spread,
 )
 from submin.query.point_metadata import PointMetadata, metadata_of_points
+from submin.storage.accuracy_map import PointAccuracy, accuracy_of, accuracy_of_all, accuracy_of_dense
 from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
@@ -142,6 +143,46 @@ class Network:
             return self._query_dense(self._dense, asked, policy, max_points)
         selections, tile_number = self._selected(asked, max_points, today() if on is None else on)
         return self.control_set(answer(self, selections, policy, tile_number))
+
+    def accuracy(
+        self,
+        *,
+        bbox: tuple[float, float, float, float] | None = None,
+        area: BaseGeometry | None = None,
+        points: Sequence[str] | NDArray[np.str_] | None = None,
+        tile: str | None = None,
+        on: date | None = None,
+    ) -> PointAccuracy:
+        """Position and accuracy of points, each by itself: no joint covariance is formed, so the points may be as many as there are.
+
+        Each point is answered for by the tile whose core holds it, or by the tile that is named.
+
+        Parameters
+        ----------
+        bbox, area, points, tile : which points, as of `query`; without any all that the network reports
+        on : day on which points must be valid; default: today (UTC)
+
+        Returns
+        -------
+        PointAccuracy
+            Tile after tile. Points whose rays determine no position are left out.
+
+        Raises
+        ------
+        QueryError
+            When too much is asked, a tile or point is unknown, or a box is not one.
+        """
+        day = today() if on is None else on
+        everything = bbox is None and area is None and points is None and tile is None
+        asked = Asked() if everything else Asked.of(bbox, area, points, tile)
+        if self._dense is not None:
+            return accuracy_of_dense(self._dense, self._dense_rows(self._dense, asked))
+        if not everything:
+            selections, number = self._selected(asked, None, day)
+            return accuracy_of(self, selections, day, number)
+        every = accuracy_of_all(self, day)
+        reported = ~every.thinned & ~every.retired
+        return every if reported.all() else every.take(reported)
 
     def export(
         self,
@@ -285,16 +326,19 @@ class Network:
         return [s for s in kept if len(s.rows)]
 
     def _query_dense(self, dense: DenseReader, asked: Asked, policy: str, max_points: int | None) -> ControlSet:
-        """Answer of a dense network; its one tile holds every point."""
+        """Answer of a dense network."""
+        return dense.answer(self._dense_rows(dense, asked), policy, max_points)
+
+    def _dense_rows(self, dense: DenseReader, asked: Asked) -> NDArray[np.int64]:
+        """Places of the points that are asked of a dense network; its one tile holds every point."""
         if asked.tile is not None:
             self.cover.tile_number(asked.tile)  # an unknown one is refused
-        if asked.area is not None:
-            rows = dense.in_area(asked.area)
-            if not len(rows):
-                asked.refuse_swapped(self.cover)
-        else:
-            rows = np.arange(len(dense.points.ids)) if asked.points is None else dense.named(asked.points)
-        return dense.answer(rows, policy, max_points)
+        if asked.area is None:
+            return np.arange(len(dense.points.ids)) if asked.points is None else dense.named(asked.points)
+        rows = dense.in_area(asked.area)
+        if not len(rows):
+            asked.refuse_swapped(self.cover)
+        return rows
 
     def cells_of_points(self, points: Sequence[str] | NDArray[np.str_]) -> dict[int, NDArray[np.str_]]:
         """Those of some points that the network can answer for, by their cell."""

@@ -27,7 +27,6 @@ from submin.errors import BusyError, InputError, QueryError
 from submin.query.point_metadata import PointMetadata
 from submin.sensors import sensor_named
 from submin.simulation.region import RegionDesign, simulate_region
-from submin.storage.accuracy_map import accuracy_map
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
@@ -181,7 +180,7 @@ def test_places(world: World) -> None:
     metres = 111_000.0 * np.abs(found.geodetic - found.registered)[:, :2].max(axis=1)
     assert 1.0 < np.median(metres[determined]) < 100.0
     assert (metres[~determined] == 0.0).all()
-    own = accuracy_map(network)
+    own = network.accuracy()
     at = np.searchsorted(found.ids, own.ids)
     off = np.abs(found.geodetic[at] - own.geodetic)  # an adjustment ends where a step is nothing beside its accuracy
     assert (111_000.0 * off[:, :2].max(axis=1) < 1e-3 * own.ce90).all() and (off[:, 2] < 1e-3 * own.le90).all()
@@ -254,7 +253,7 @@ def test_retired_points_are_left_out_of_areas_and_tiles_after_their_day(copy: Wo
     tile = after.cover.tile_name(after.snapshot.tile_numbers()[0])
     for day, here in ((date(2026, 5, 31), every.ids), (date(2026, 6, 1), np.setdiff1d(every.ids, gone))):
         np.testing.assert_array_equal(after.query(bbox=EVERYWHERE, policy="rigorous", on=day).ids, here)
-        np.testing.assert_array_equal(np.sort(accuracy_map(after, day).ids), here)
+        np.testing.assert_array_equal(np.sort(after.accuracy(on=day).ids), here)
         held = network.query(tile=tile).ids
         np.testing.assert_array_equal(after.query(tile=tile, on=day).ids, np.intersect1d(held, here))
     left = after.query(bbox=EVERYWHERE, policy="rigorous", on=date(2026, 6, 1))

@@ -22,7 +22,6 @@ from submin.errors import InputError
 from submin.network.id_hash import hash_ids
 from submin.network.thinning import one_a_square, reported_points
 from submin.simulation.region import RegionDesign, SimulatedRegion, simulate_region
-from submin.storage.accuracy_map import accuracy_map
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.network_store import Snapshot
@@ -151,7 +150,7 @@ def test_order_leaves_no_trace_in_the_selection(case: Case) -> None:
     ids = together.query(bbox=EVERYWHERE, policy="rigorous").ids
     assert len(ids) > 5
     np.testing.assert_array_equal(turned.query(bbox=EVERYWHERE, policy="rigorous").ids, ids)
-    np.testing.assert_array_equal(np.sort(accuracy_map(turned).ids), ids)
+    np.testing.assert_array_equal(np.sort(turned.accuracy().ids), ids)
 
 
 def test_at_most_one_a_square_and_cell_and_none_without_a_reason(pair: tuple) -> None:

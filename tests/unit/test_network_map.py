@@ -17,9 +17,9 @@ from orchestration import network_map
 from orchestration.create import create
 from orchestration.network_map import draw_network, network_figure
 from orchestration.run import RunResult
-from submin.errors import InputError
+from submin.errors import InputError, QueryError
 from submin.simulation.region import RegionDesign, simulate_region
-from submin.storage.accuracy_map import PointAccuracy, accuracy_map
+from submin.storage.accuracy_map import PointAccuracy
 from submin.storage.catalogue_schema import CatalogueMetadata
 from submin.storage.simulated import write_region
 from submin.tiling.cover import cover_area
@@ -44,7 +44,7 @@ def network(made: tuple[submin.Network, RunResult]) -> submin.Network:
 
 @pytest.fixture(scope="module")
 def every(network: submin.Network) -> PointAccuracy:
-    return accuracy_map(network)
+    return network.accuracy()
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +94,40 @@ class TestAccuracyMap:
         asked = network.query(bbox=(west, south, east, north), policy="rigorous")
         np.testing.assert_array_equal(np.sort(every.ids), asked.ids)
 
+    def test_is_asked_for_like_a_query(self, network: submin.Network, every: PointAccuracy) -> None:
+        (west, south), (east, north) = every.geodetic[:, :2].min(axis=0) + 0.1, every.geodetic[:, :2].max(axis=0) - 0.1
+        area = shapely.Polygon([(west, south), (east, south), (east, north)])
+        some = every.ids[::7]
+        for question in ({"bbox": (west, south, east, north)}, {"area": area}, {"points": some}, {"area": area, "tile": "r000c001"}):
+            found, asked = network.accuracy(**question), network.query(**question)
+            np.testing.assert_array_equal(np.sort(found.ids), asked.ids)
+            assert 10 < len(found) < len(every)
+            if "tile" not in question:
+                row = np.flatnonzero(np.isin(every.ids, found.ids))
+                assert set(found.ids) == set(every.ids[row])
+                by_id, same = np.argsort(found.ids), row[np.argsort(every.ids[row])]
+                np.testing.assert_allclose(found.local_covariance[by_id], every.local_covariance[same], rtol=1e-10)
+
+    def test_of_a_tile_is_that_of_this_tile_alone(self, network: submin.Network) -> None:
+        found, asked = network.accuracy(tile="r000c001"), network.query(tile="r000c001")
+        by_id = np.argsort(found.ids)
+        np.testing.assert_array_equal(found.ids[by_id], asked.ids)
+        assert set(found.tile) == {"r000c001"} < set(asked.tile_of_point)
+        np.testing.assert_allclose(found.local_covariance[by_id], asked.local_covariance, rtol=1e-9)
+        np.testing.assert_allclose(found.geodetic[by_id], asked.geodetic, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(found.ce90[by_id], asked.ce90, rtol=1e-9)
+        np.testing.assert_allclose(found.le90[by_id], asked.le90, rtol=1e-9)
+
+    def test_refuses_what_a_query_refuses(self, network: submin.Network) -> None:
+        with pytest.raises(QueryError, match="not in the network"):
+            network.accuracy(points=["nowhere"])
+        with pytest.raises(QueryError, match="asked by bbox and points"):
+            network.accuracy(bbox=(99.0, 34.0, 101.0, 36.0), points=["nowhere"])
+        with pytest.raises(QueryError, match="longitude and latitude look swapped"):
+            network.accuracy(bbox=(35.0, 99.0, 36.0, 101.0))
+
     def test_of_an_empty_network(self, empty: submin.Network) -> None:
-        every = accuracy_map(empty)
+        every = empty.accuracy()
         assert len(every) == 0
         assert every.geodetic.shape == (0, 3)
 
