@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import asyncio
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import zarr
 from numpy.typing import NDArray
+from zarr.core.sync import sync
 
 from submin.errors import StoreError
 from submin.network.id_hash import hash_ids as hash_ids  # by which the directory finds points
@@ -87,16 +90,86 @@ def write_record(parent: zarr.Group, name: str, parts: Mapping[str, AnyArray], a
     return group
 
 
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A record as it was read: its attributes, and named arrays of it."""
+
+    attributes: Mapping[str, Any]
+    parts: Mapping[str, AnyArray]
+
+
 def read_record(group: zarr.Group, wanted: Iterable[str] | None = None) -> dict[str, AnyArray]:
     """Named arrays of a record: all, or only those wanted."""
-    names = None if wanted is None else set(wanted)
-    chosen = [entry for entry in attributes_of(group)["layout"] if names is None or str(entry[0]).removesuffix(".ends") in names]
+    return sync(_parts(group._async_group, None if wanted is None else frozenset(wanted)))
+
+
+def read_records(parent: zarr.Group, names: Iterable[str], wanted: Iterable[str] | None = None) -> list[Record | None]:
+    """Records of these names, read side by side: all arrays of each, or only those wanted; None where there is none of the name."""
+    chosen = None if wanted is None else frozenset(wanted)
+
+    async def one(name: str) -> Record | None:
+        try:
+            group = await parent._async_group.getitem(name)
+        except KeyError:
+            return None
+        if not isinstance(group, zarr.AsyncGroup):
+            raise StoreError(f"the store has an array {name!r} in {parent.path!r} where a group is expected; it is damaged")
+        return Record(dict(group.attrs), await _parts(group, chosen))
+
+    async def every() -> list[Record | None]:
+        return list(await asyncio.gather(*(one(name) for name in names)))
+
+    return sync(every())
+
+
+def existing_groups(parent: zarr.Group, names: Iterable[str]) -> list[bool]:
+    """Whether a group has members of these names."""
+
+    async def one(name: str) -> bool:
+        return bool(await parent._async_group.contains(name))
+
+    async def every() -> list[bool]:
+        return list(await asyncio.gather(*(one(name) for name in names)))
+
+    return sync(every())
+
+
+def member_names(group: zarr.Group) -> list[str]:
+    """Names of the members of a group, ascending; none of them is opened."""
+
+    async def every() -> list[str]:
+        return [name async for name in group.store.list_dir(group.path)]
+
+    return sorted(name for name in sync(every()) if name != "zarr.json")
+
+
+async def _array(group: zarr.AsyncGroup, name: str) -> zarr.AsyncArray[Any]:
+    try:
+        found = await group.getitem(name)
+    except KeyError:
+        found = None
+    if not isinstance(found, zarr.AsyncArray):
+        raise StoreError(f"the store has no array {name!r} in {group.path!r}; it is damaged")
+    return found
+
+
+async def _span(group: zarr.AsyncGroup, name: str, start: int, stop: int | None) -> AnyArray:
+    """Entries of an array of one dimension, from ``start`` to before ``stop``."""
+    array = await _array(group, name)
+    stop = array.shape[0] if stop is None else min(stop, array.shape[0])
+    return np.asarray(await array.getitem(slice(start, stop))) if stop > start else np.empty(0, dtype=array.dtype)
+
+
+async def _parts(group: zarr.AsyncGroup, names: frozenset[str] | None) -> dict[str, AnyArray]:
+    chosen = [entry for entry in group.attrs["layout"] if names is None or str(entry[0]).removesuffix(".ends") in names]
     spans: dict[str, tuple[int, int]] = {}
     for _, kind, start, shape in chosen:
         stop = start + int(np.prod(shape))
         low, high = spans.get(kind, (start, stop))
         spans[kind] = (min(low, start), max(high, stop))
-    data = {kind: np.asarray(array_of(group, kind)[low:high]) if high > low else np.empty(0) for kind, (low, high) in spans.items()}
+    filled = [kind for kind, (low, high) in spans.items() if high > low]  # an array without entries is not stored
+    read = await asyncio.gather(*(_span(group, kind, *spans[kind]) for kind in filled))
+    data = dict.fromkeys(spans, np.empty(0)) | dict(zip(filled, read, strict=True))
     parts: dict[str, AnyArray] = {}
     for part, kind, start, shape in chosen:
         at = start - spans[kind][0]
@@ -146,18 +219,28 @@ def append_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
 
 def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: int = 0, stop: int | None = None) -> dict[str, AnyArray]:
     """Columns of the rows from ``start`` to before ``stop``."""
+    return read_spans(group, wanted, [(start, stop)])[0]
+
+
+def read_spans(group: zarr.Group, wanted: Iterable[str] | None, spans: Sequence[tuple[int, int | None]]) -> list[dict[str, AnyArray]]:
+    """Columns of several spans of rows, each from its first to before its last, read side by side."""
     kinds = attributes_of(group)["columns"]
-    columns: dict[str, AnyArray] = {}
-    for column in kinds if wanted is None else wanted:
+    columns = list(kinds if wanted is None else wanted)
+
+    async def one(column: str, start: int, stop: int | None) -> AnyArray:
         if kinds[column] != "text":
-            columns[column] = np.asarray(array_of(group, column)[start:stop])
-            continue
-        ends = np.asarray(array_of(group, column + ".ends")[max(start - 1, 0) : stop])
+            return await _span(group._async_group, column, start, stop)
+        ends = await _span(group._async_group, column + ".ends", max(start - 1, 0), stop)
         base = int(ends[0]) if start > 0 and len(ends) else 0
         ends = ends[1:] if start > 0 else ends
-        data = np.asarray(array_of(group, column)[base : int(ends[-1])]) if len(ends) else np.empty(0, dtype=np.uint8)
-        columns[column] = decode_text(data, ends - base)
-    return columns
+        data = await _span(group._async_group, column, base, int(ends[-1])) if len(ends) else np.empty(0, dtype=np.uint8)
+        return decode_text(data, ends - base)
+
+    async def every() -> list[AnyArray]:
+        return list(await asyncio.gather(*(one(column, start, stop) for start, stop in spans for column in columns)))
+
+    read = iter(sync(every()))
+    return [{column: next(read) for column in columns} for _ in spans]
 
 
 def replace_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
