@@ -16,7 +16,7 @@ from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
 from submin.geodesy import WGS84, geocentric_to_geodetic, local_axes, rotate_covariance
 from submin.network.network_image import image_set
-from submin.network.sub_min import GroundPart, SubMin, factor, joint_covariance, loadings, locate, point_covariances
+from submin.network.sub_min import GroundPart, SubMin, covariances_of, factor, joint_covariance, loadings, locate
 from submin.sensors import width_of
 from submin.storage.block_images import network_images
 from submin.storage.catalogue_schema import Block
@@ -33,14 +33,14 @@ class Solution:
     Attributes
     ----------
     ids : (n,) ascending; geocentric : (n, 3) metres
-    loading : (3n, m p), own : (n, 3, 3), images : what their covariance is made of, see `submin.network.sub_min`
+    part, loading (3n, m p), images : what their covariance is made of, see `submin.network.sub_min`
     rejected : rays rejected as blunders; released : images found to be bad
     """
 
     ids: Ids
     geocentric: Array
+    part: GroundPart
     loading: sp.csr_array
-    own: Array
     images: SubMin
     rejected: int
     released: int
@@ -48,13 +48,12 @@ class Solution:
     @cached_property
     def local_covariance(self) -> Array:
         """Covariance (n, 3, 3) of each point alone, m2, in its local axes."""
-        covariance = point_covariances(self.loading, self.own, self.images.covariance)
-        return rotate_covariance(covariance, local_axes(geocentric_to_geodetic(self.geocentric)))
+        return rotate_covariance(covariances_of(self.part, self.images), local_axes(geocentric_to_geodetic(self.geocentric)))
 
     def joint_covariance(self, rows: Rows) -> Array:
         """Covariance (3k, 3k) of some points, m2, geocentric axes."""
         axes = (3 * np.asarray(rows)[:, None] + np.arange(3)).ravel()
-        return joint_covariance(self.loading[axes], self.own[rows], self.images.covariance)
+        return joint_covariance(self.loading[axes], self.part.factors.own[rows], self.images.covariance)
 
 
 def solve(blocks: Iterable[Block], judged: bool = True) -> Solution:
@@ -83,6 +82,6 @@ def solve(blocks: Iterable[Block], judged: bool = True) -> Solution:
     state = factor(eliminate(linear, weight, len(images)), np.arange(len(images), dtype=np.int32), images)
     part = GroundPart(origin, linear, point_factors(linear, weight))
     return Solution(
-        ids, locate(part, state), loadings([part], state.images, images.parameters), part.factors.own, state,
+        ids, locate(part, state), part, loadings([part], state.images, images.parameters), state,
         int((~accepted).sum()), int(released.sum()),
     )  # fmt: skip

@@ -24,7 +24,7 @@ from benchmarks.tile_scene import PER_TRIPLET, TileScene, tile_scene
 from submin.adjustment.elimination import Sums
 from submin.network.cell import Cell, factors, summed
 from submin.network.low_rank import fuse, new_rays, refactored, update
-from submin.network.sub_min import GroundPart, SubMin, add_sums, factor, loadings, point_covariances
+from submin.network.sub_min import GroundPart, SubMin, add_sums, covariances_of, factor, loadings
 
 Array = NDArray[np.float64]
 
@@ -103,7 +103,7 @@ def _ground(cell: Cell, scene: TileScene, points: NDArray[np.int64]) -> GroundPa
 def _every_covariance(cell: Cell, scene: TileScene, state: SubMin) -> Array:
     """Covariance of each determined point of a cell by itself."""
     part = _ground(cell, scene, np.flatnonzero(_determined(cell)))
-    return point_covariances(loadings([part], state.images, state.theta.shape[1]), part.factors.own, state.covariance)
+    return covariances_of(part, state)
 
 
 def _determined(cell: Cell) -> NDArray[np.bool_]:

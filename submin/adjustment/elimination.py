@@ -240,6 +240,62 @@ def point_factors(linear: LinearRays, weight: Array) -> PointFactors:
     return PointFactors(*_point_factors(linear.first, weight, linear.by_ground, linear.by_parameters, linear.y))
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _point_covariances(first: Offsets, image: Index, own: Array, loading: Array, covariance: Array) -> Array:
+    p, points, total = loading.shape[2], len(first) - 1, own.copy()
+    kind = np.zeros(points, np.uint64)
+    for j in range(points):
+        for a in range(first[j], first[j + 1]):
+            kind[j] = kind[j] * np.uint64(1000003) + np.uint64(image[a] + 1)
+    size = most_rays(first) * p
+    u, m = np.empty((3, size)), np.empty((size, size))
+    before, count = 0, 0
+    # points that the same images see come together: to gather their part of M costs more than the products with it
+    for j in np.argsort(kind):
+        start, n = first[j], first[j + 1] - first[j]
+        known = n == count
+        for a in range(n):
+            known = known and image[start + a] == image[before + a]
+        if not known:
+            for a in range(n):
+                for b in range(n):
+                    at, to = image[start + a] * p, image[start + b] * p
+                    for v in range(p):
+                        for w in range(p):
+                            m[a * p + v, b * p + w] = covariance[at + v, to + w]
+        before, count = start, n
+        for a in range(n):
+            for c in range(3):
+                for v in range(p):
+                    u[c, a * p + v] = loading[start + a, c, v]
+        whole = total[j]
+        for i in range(n * p):
+            row, x, y, z = m[i], 0.0, 0.0, 0.0
+            for b in range(n * p):
+                x += row[b] * u[0, b]
+                y += row[b] * u[1, b]
+                z += row[b] * u[2, b]
+            whole[0, 0] += u[0, i] * x
+            whole[1, 0] += u[1, i] * x
+            whole[1, 1] += u[1, i] * y
+            whole[2, 0] += u[2, i] * x
+            whole[2, 1] += u[2, i] * y
+            whole[2, 2] += u[2, i] * z
+        whole[0, 1], whole[0, 2], whole[1, 2] = whole[1, 0], whole[2, 0], whole[2, 1]
+    return total
+
+
+def point_covariances(first: Offsets, image: Index, factors: PointFactors, covariance: Array) -> Array:
+    """``P_jj = D + U M U'`` (n, 3, 3) of each point by itself, square metres; NaN for points that are not determined.
+
+    Parameters
+    ----------
+    first : (n + 1,) offsets of each point's rays; image : (r,) place of each ray's image in M
+    covariance : M (m p, m p), both triangles
+    """
+    return np.asarray(_point_covariances(first, image, factors.own, factors.loading, covariance))
+
+
 def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) -> Array:
     """Estimated ``x - x0`` (n, 3) in metres, given the images' corrections (m, p); 0 for points that are not determined."""
     by_ray = np.einsum("rcp,rp->rc", factors.loading, theta[linear.image])

@@ -19,7 +19,7 @@ from scipy.special import gammaincinv, ndtri
 
 from submin.adjustment.adjustment import Adjustment
 from submin.adjustment.blunders import CRITICAL_RAY, TESTABLE
-from submin.adjustment.elimination import LinearRays, PointFactors, Sums, eliminate, linearise, point_factors
+from submin.adjustment.elimination import LinearRays, PointFactors, Sums, eliminate, linearise, point_covariances, point_factors
 from submin.adjustment.estimation import ImageEstimate, estimate_images
 from submin.adjustment.images import ImageSet
 from submin.adjustment.point_basis import Array, Index, Offsets, gather, most_rays, orthonormal
@@ -52,24 +52,6 @@ def _redundancy_numbers(first: Offsets, image: Index, weight: Array, by_ground: 
             nothing = b[k, 0] == 0.0 and b[k, 1] == 0.0 and b[k, 2] == 0.0  # the empty row of a view along one axis
             numbers[rays[k // 2], k % 2] = 0.0 if nothing or 2 * n <= rank else residual_covariance(basis, inner, free, k, k)
     return numbers
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _point_covariances(first: Offsets, image: Index, own: Array, loading: Array, covariance: Array) -> Array:
-    """``D + U M U'`` (n, 3, 3) of each point."""
-    p, total = loading.shape[2], own.copy()
-    for j in range(len(first) - 1):
-        for a in range(first[j], first[j + 1]):
-            for b in range(first[j], first[j + 1]):
-                at, to = image[a] * p, image[b] * p
-                for c in range(3):
-                    for v in range(p):
-                        half = 0.0
-                        for u in range(p):
-                            half += loading[a, c, u] * covariance[at + u, to + v]
-                        for d in range(3):
-                            total[j, c, d] += half * loading[b, d, v]
-    return total
 
 
 @dataclass(frozen=True)
@@ -148,7 +130,7 @@ class Quality:
     def point_covariances(self) -> Array:
         """Covariance (n, 3, 3) of each point, geocentric square metres; NaN for points that are not determined."""
         x, own = self.linear, self._factors
-        return np.asarray(_point_covariances(x.first, x.image, own.own, own.loading, self.estimate.covariance))
+        return point_covariances(x.first, x.image, own, self.estimate.covariance)
 
     def joint_covariance(self, points: NDArray[np.integer]) -> Array:
         """Joint covariance (3k, 3k) of some points (rows (k,)), geocentric square metres, point-major; NaN for those not determined."""

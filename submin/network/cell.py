@@ -171,10 +171,16 @@ def linear_rays(cell: Cell, images: ImageSet, points: NDArray[np.int64] | None =
     """
     if points is None:
         return linearise(images, cell.rays, cell.theta, cell.linearised_at, cell.origin)
-    chosen = np.isin(cell.rays.point, points)
-    rays = cell.rays.take(chosen)
-    rays = replace(rays, point=np.searchsorted(points, rays.point).astype(np.int32))
-    return linearise(images, rays, cell.theta, cell.linearised_at[points], cell.origin[points])
+    return linearise(images, rays_of(cell, points), cell.theta, cell.linearised_at[points], cell.origin[points])
+
+
+def rays_of(cell: Cell, points: NDArray[np.int64]) -> Rays:
+    """All rays of some of the cell's points (rows, ascending); ``point`` counts these."""
+    place = np.full(len(cell), -1, dtype=np.int32)
+    place[points] = np.arange(len(points), dtype=np.int32)
+    point = place[cell.rays.point]
+    chosen = point >= 0
+    return replace(cell.rays.take(chosen), point=point[chosen])
 
 
 def summed(cell: Cell, images: ImageSet) -> Cell:
@@ -197,9 +203,9 @@ def reordered(sums: Sums, order: Index | NDArray[np.int64], parameters: int) -> 
 
 def factors(cell: Cell, images: ImageSet, points: NDArray[np.int64]) -> tuple[LinearRays, PointFactors]:
     """Own parts and loadings of some of the cell's points (rows, ascending)."""
-    linear = linear_rays(cell, images, points)
-    weight = cell.rays.accepted[np.isin(cell.rays.point, points)].astype(np.float64)
-    return linear, point_factors(linear, weight)
+    rays = rays_of(cell, points)
+    linear = linearise(images, rays, cell.theta, cell.linearised_at[points], cell.origin[points])
+    return linear, point_factors(linear, rays.accepted.astype(np.float64))
 
 
 def loses(before: Cell, after: Cell) -> bool:

@@ -17,7 +17,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from submin.adjustment.elimination import LinearRays, PointFactors, Sums, ground_corrections
+from submin.adjustment.elimination import LinearRays, PointFactors, Sums, ground_corrections, point_covariances
 from submin.adjustment.estimation import covariance_of, estimate_images
 from submin.adjustment.images import ImageSet
 from submin.adjustment.symmetric import add_into, fill_symmetric
@@ -43,6 +43,7 @@ class SubMin:
     chi_square : weighted squares of residuals, a priori model included
     redundancy : degrees of freedom of ``chi_square``
     whole : True when it is that of the whole network
+    behind : rows of all images that the state comes from, where ``images`` are some of them; None: the same
     """
 
     images: Index
@@ -51,6 +52,7 @@ class SubMin:
     chi_square: float
     redundancy: int
     whole: bool = False
+    behind: Index | None = None
 
 
 def wider(sub_min: SubMin, parameters: int) -> SubMin:
@@ -63,6 +65,17 @@ def wider(sub_min: SubMin, parameters: int) -> SubMin:
     theta[:, :old] = sub_min.theta
     covariance[np.ix_(rows, rows)] = sub_min.covariance
     return replace(sub_min, theta=theta, covariance=covariance)
+
+
+def marginal(sub_min: SubMin, images: Index) -> SubMin:
+    """The sub-MIN of those of its images that are among ``images`` (rows of the network) alone."""
+    chosen, p = np.flatnonzero(np.isin(sub_min.images, images)), sub_min.theta.shape[1]
+    if len(chosen) == len(sub_min.images):
+        return sub_min
+    rows = (chosen[:, None] * p + np.arange(p)).ravel()
+    return replace(
+        sub_min, images=sub_min.images[chosen], theta=sub_min.theta[chosen], covariance=sub_min.covariance[np.ix_(rows, rows)]
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -178,44 +191,7 @@ def joint_covariance(loading: sp.csr_array, own: Array, covariance: Array) -> Ar
     return fill_symmetric(joint)
 
 
-def point_covariances(loading: sp.csr_array, own: Array, covariance: Array) -> Array:
-    """Covariance (n, 3, 3) of each point by itself, without the joint matrix; arguments as in `joint_covariance`."""
-    covariances = own.copy()
-    _add_point_covariances(loading.indptr.astype(np.int64), loading.indices.astype(np.int32), loading.data, covariance, covariances)
-    return covariances
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _add_point_covariances(first: Rows, column: Index, value: Array, covariance: Array, total: Array) -> None:
-    """Add ``U M U'`` of each point to (n, 3, 3), entry by entry of U: a point loads on a handful of images."""
-    for j in range(len(total)):
-        start, count = first[3 * j], first[3 * j + 1] - first[3 * j]
-        alike = first[3 * j + 3] - start == 3 * count and first[3 * j + 2] - start == 2 * count
-        if alike:
-            for a in range(start, start + count):
-                alike = alike and column[a] == column[a + count] and column[a] == column[a + 2 * count]
-        if alike:  # the three coordinates load on the same parameters: each entry of M is fetched once
-            own = total[j]
-            for a in range(start, start + count):
-                row, x, y, z = covariance[column[a]], 0.0, 0.0, 0.0
-                for b in range(start, start + count):
-                    m = row[column[b]]
-                    x += m * value[b]
-                    y += m * value[b + count]
-                    z += m * value[b + 2 * count]
-                u, v, w = value[a], value[a + count], value[a + 2 * count]
-                own[0, 0] += u * x
-                own[1, 0] += v * x
-                own[1, 1] += v * y
-                own[2, 0] += w * x
-                own[2, 1] += w * y
-                own[2, 2] += w * z
-        else:
-            for c in range(3):
-                for d in range(c + 1):
-                    for a in range(first[3 * j + c], first[3 * j + c + 1]):
-                        row, part = covariance[column[a]], 0.0
-                        for b in range(first[3 * j + d], first[3 * j + d + 1]):
-                            part += row[column[b]] * value[b]
-                        total[j, c, d] += value[a] * part
-        total[j, 0, 1], total[j, 0, 2], total[j, 1, 2] = total[j, 1, 0], total[j, 2, 0], total[j, 2, 1]
+def covariances_of(part: GroundPart, sub_min: SubMin) -> Array:
+    """Covariance (n, 3, 3) of each of the part's points by itself, geocentric square metres."""
+    at = np.searchsorted(sub_min.images, part.linear.image).astype(np.int32)
+    return point_covariances(part.linear.first, at, part.factors, sub_min.covariance)

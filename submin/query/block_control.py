@@ -95,7 +95,7 @@ def control_of_block(
 
 
 @dataclass(frozen=True)
-class _Joined:
+class _Joined(NetworkSource):
     """A network with the images of a block behind its own, of which it has no rays."""
 
     source: NetworkSource
@@ -109,8 +109,14 @@ class _Joined:
     def cell_numbers(self) -> tuple[int, ...]:
         return self.source.cell_numbers()
 
+    def existing(self, numbers: Sequence[int]) -> tuple[int, ...]:
+        return self.source.existing(numbers)
+
     def cell(self, number: int) -> Cell:
         return self.source.cell(number)
+
+    def some_cells(self, numbers: Sequence[int]) -> list[Cell]:
+        return self.source.some_cells(numbers)
 
     def cell_sums(self, number: int) -> tuple[Index, Sums]:
         images, sums = self.source.cell_sums(number)

@@ -26,7 +26,7 @@ from submin.adjustment.priors import ImagePrior, prior_factor
 from submin.adjustment.rays import Rays
 from submin.errors import NumericalError
 from submin.network.innovation import BlockTest, allowed_cameras, allowed_points
-from submin.network.sub_min import GroundPart, SubMin, loadings, locate
+from submin.network.sub_min import GroundPart, SubMin, loadings, locate, marginal
 from submin.query.planner import Selection, determined_parts, points_named, well_spread
 from submin.query.source import Index, NetworkSource
 
@@ -107,14 +107,7 @@ def common_points(
     seen = np.unique(np.concatenate([mates, *(part.linear.image for part in parts)])).astype(np.int32)
     found = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
     order = np.argsort(found, kind="stable")
-    return CommonPoints(found[order], order, tuple(parts), mates, source.image_set(mates).priors, _marginal(sub_min(tile), seen))
-
-
-def _marginal(state: SubMin, images: Index) -> SubMin:
-    """A sub-MIN's marginal on some of its images."""
-    at, p = np.searchsorted(state.images, images), state.theta.shape[1]
-    rows = (at[:, None] * p + np.arange(p)).ravel()
-    return replace(state, images=images, theta=state.theta[at], covariance=state.covariance[np.ix_(rows, rows)])
+    return CommonPoints(found[order], order, tuple(parts), mates, source.image_set(mates).priors, marginal(sub_min(tile), seen))
 
 
 def _tile_of_most(source: NetworkSource, selections: Sequence[Selection]) -> int | None:

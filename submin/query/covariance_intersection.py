@@ -23,6 +23,7 @@ from submin.adjustment.estimation import cholesky
 from submin.network.sub_min import GroundPart, SubMin
 from submin.query.padded_tiles import padded_tiles
 from submin.query.source import Index, NetworkSource
+from submin.query.tile_pair import TilePair
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,13 @@ CERTIFICATE = 1e-6
 
 
 def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: Sequence[GroundPart]) -> SubMin:
-    """A posteriori state of all images that the tiles see, by Covariance Intersection with weights best for the points of ``parts``."""
+    """A posteriori state of all images that the tiles see, by Covariance Intersection with weights best for the points of ``parts``.
+
+    Of two tiles, which are what most queries across a border concern, that of ``images`` alone.
+    """
+    if len(tiles) == 2:
+        pair = source.kept(("pair", tuple(tiles)), lambda: TilePair.of(padded_tiles(source, tiles)))
+        return pair.state(pair.weight(pair.squares(parts)), images)
     padded = padded_tiles(source, tiles)
     weights = np.ones(1) if len(tiles) == 1 else intersection_weights(padded.of_tiles, padded.functionals(parts))
     return padded.weighted(padded.holds @ weights, 1.0)

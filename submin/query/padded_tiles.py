@@ -92,7 +92,7 @@ class PaddedTiles:
 def padded_tiles(source: NetworkSource, tiles: Sequence[int]) -> PaddedTiles:
     """Bring some tiles to the union of the images that they see."""
     cells = existing_cells(source, tiles)
-    sums = [source.cell_sums(cell) for cell in cells]
+    sums = source.some_sums(cells)
     rows = np.unique(np.concatenate([of_cell for of_cell, _ in sums])).astype(np.int32)
     images = source.image_set(rows)
     held = np.array([[tile in source.cover.holders(cell) for tile in tiles] for cell in cells])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from submin.adjustment.elimination import PointFactors
+from submin.adjustment.images import ImageSet
 from submin.errors import QueryError
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.cell import Cell, factors
@@ -76,12 +77,8 @@ def points_in_area(source: NetworkSource, area: BaseGeometry, every: bool = Fals
 
     With ``every`` also points of fewer than two rays, and those whose registered position alone lies in the area.
     """
-    near = set(cells_near(source, area))
     selections = []
-    for number in source.cell_numbers():
-        if number not in near:
-            continue
-        cell = source.cell(number)
+    for cell in source.some_cells(cells_near(source, area)):
         at = geocentric_to_geodetic(cell.linearised_at, source.cover.ellipsoid)
         inside = np.asarray(shapely.intersects_xy(area, at[:, 0], at[:, 1]), dtype=bool)
         if every:
@@ -93,15 +90,13 @@ def points_in_area(source: NetworkSource, area: BaseGeometry, every: bool = Fals
 
 def all_points(source: NetworkSource) -> list[Selection]:
     """All determined points of a network."""
-    cells = [source.cell(number) for number in source.cell_numbers()]
+    cells = source.some_cells(source.cell_numbers())
     return [s for s in (Selection(cell, np.flatnonzero(_wanted(cell, every=False))) for cell in cells) if len(s.rows)]
 
 
 def points_of_tile(source: NetworkSource, number: int, every: bool = False, core: bool = False) -> list[Selection]:
     """All determined points that a tile, or with ``core`` its core, holds; with ``every`` also those of fewer than two rays."""
-    existing = set(source.cell_numbers())
-    held = source.cover.cells_owned(number) if core else source.cover.cells_held(number)
-    cells = [source.cell(cell) for cell in held if cell in existing]
+    cells = source.some_cells(source.existing(source.cover.cells_owned(number) if core else source.cover.cells_held(number)))
     return [s for s in (Selection(cell, np.flatnonzero(_wanted(cell, every))) for cell in cells) if len(s.rows)]
 
 
@@ -114,9 +109,8 @@ def points_named(
     """
     found = np.zeros(len(ids), dtype=bool)
     selections = []
-    for number in np.unique(cells[cells >= 0]):
-        cell = source.cell(int(number))
-        wanted = np.flatnonzero(cells == number)
+    for cell in source.some_cells(np.unique(cells[cells >= 0]).tolist()):
+        wanted = np.flatnonzero(cells == cell.number)
         row = np.minimum(np.searchsorted(cell.point_ids, ids[wanted]), max(len(cell) - 1, 0))
         held = (cell.point_ids[row] == ids[wanted]) & _wanted(cell, every)[row] if len(cell) else np.zeros(len(wanted), dtype=bool)
         found[wanted[held]] = True
@@ -125,7 +119,7 @@ def points_named(
 
 
 def cells_near(source: NetworkSource, area: BaseGeometry) -> list[int]:
-    """Cells with points in or near an area."""
+    """Cells with points in or near an area, ascending."""
     cover = source.cover
     outline = shapely.get_coordinates(shapely.segmentize(area, 0.25) if not area.is_empty else area)
     if not len(outline):
@@ -137,11 +131,11 @@ def cells_near(source: NetworkSource, area: BaseGeometry) -> list[int]:
     west, south = x.min() - SEARCH_MARGIN_METRES, y.min() - SEARCH_MARGIN_METRES
     east, north = x.max() + SEARCH_MARGIN_METRES, y.max() + SEARCH_MARGIN_METRES
     near = []
-    for number in source.cell_numbers():
-        w, s, e, n = cover.core_bounds(cover.owner(number))
+    for number in (cell for t in cover.tiles_meeting(west, south, east, north) for cell in cover.cells_owned(t)):
+        w, s, e, n = cover.cell_bounds(number)
         if w <= east and e >= west and s <= north and n >= south:
             near.append(number)
-    return near
+    return list(source.existing(sorted(near)))
 
 
 def well_spread(source: NetworkSource, selections: Sequence[Selection], most: int) -> list[Selection]:
@@ -198,7 +192,6 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     policy, tiles = choose(source, kept, policy, tile_number)
     images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
     state = POLICIES[policy](source, tiles, images, parts)
-    held = {cell for t in tiles for cell in source.cover.cells_held(t)}
     ids = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
     order = np.argsort(ids, kind="stable")
     axes = (3 * order[:, None] + np.arange(3)).ravel()  # sorted before the joint matrix is formed, which is never copied
@@ -210,8 +203,8 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
         joint_covariance(loading, own, state.covariance),
         np.concatenate([np.full(len(s.rows), source.cover.owner(s.cell.number)) for s in kept])[order],
         np.concatenate([ray_counts(s.cell)[s.rows] for s in kept])[order],
-        policy, tuple(tiles), state.images,
-        state.whole or (policy in ("tile", "rigorous") and held.issuperset(source.cell_numbers())),
+        policy, tuple(tiles), state.images if state.behind is None else state.behind,
+        state.whole or (policy in ("tile", "rigorous") and hold_all(source, tiles)),
     )  # fmt: skip
 
 
@@ -239,20 +232,30 @@ def choose(source: NetworkSource, selections: Sequence[Selection], policy: str, 
     return ("rigorous" if policy == "auto" else policy), sorted({t for cell in cells for t in cover.holders(cell)})
 
 
+def hold_all(source: NetworkSource, tiles: Sequence[int]) -> bool:
+    """Whether some tiles together hold every cell of the network."""
+    cover = source.cover
+    held = {cell for tile in tiles for cell in cover.cells_held(tile)}
+    beyond = sorted({cell for tile in tiles for other in cover.neighbours(tile) for cell in cover.cells_owned(other)} - held)
+    # a neighbour's cell is proof enough, mostly; only without one must all cells be listed
+    return not source.existing(beyond) and held.issuperset(source.cell_numbers())
+
+
 def determined_parts(source: NetworkSource, selections: Sequence[Selection]) -> tuple[list[Selection], list[GroundPart]]:
     """Those of some points that are determined, and their ground parts; cells without any are left out."""
-    both = [ground_part(source, selection) for selection in selections]
+    rows = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(s.cell.images for s in selections)]))
+    images = source.image_set(rows)
+    both = [ground_part(s, images.take(np.searchsorted(rows, s.cell.images))) for s in selections]
     return [kept for kept, _ in both if len(kept.rows)], [part for kept, part in both if len(kept.rows)]
 
 
-def ground_part(source: NetworkSource, selection: Selection) -> tuple[Selection, GroundPart]:
-    """Own parts and loadings of the selected points; those of deficient rank are left out."""
+def ground_part(selection: Selection, images: ImageSet) -> tuple[Selection, GroundPart]:
+    """Own parts and loadings of the selected points; those of deficient rank are left out. ``images`` are those of the cell."""
     cell = selection.cell
-    images = source.image_set(cell.images)
     linear, point_factors = factors(cell, images, selection.rows)
     good = determined_by(point_factors)
     if not good.all():
-        return ground_part(source, Selection(cell, selection.rows[good]))
+        return ground_part(Selection(cell, selection.rows[good]), images)
     return selection, GroundPart(cell.origin[selection.rows], replace(linear, image=cell.images[linear.image]), point_factors)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Hashable, Sequence
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,11 @@ from submin.network.sub_min import SubMin
 from submin.tiling.cover import Cover
 
 Index = NDArray[np.int32]
+T = TypeVar("T")
 
 
 class NetworkSource(Protocol):
-    """One version of a network."""
+    """One version of a network. What has a body here need not be there in a class that is derived from this one: it is then only slower."""
 
     @property
     def cover(self) -> Cover:
@@ -29,13 +30,30 @@ class NetworkSource(Protocol):
         """Cells that hold points, ascending."""
         ...
 
+    def existing(self, numbers: Sequence[int]) -> tuple[int, ...]:
+        """Those of some cells that hold points, in their order."""
+        there = set(self.cell_numbers())
+        return tuple(number for number in numbers if number in there)
+
     def cell(self, number: int) -> Cell:
         """A cell without its sums."""
         ...
 
+    def some_cells(self, numbers: Sequence[int]) -> list[Cell]:
+        """Cells without their sums."""
+        return [self.cell(number) for number in numbers]
+
     def cell_sums(self, number: int) -> tuple[Index, Sums]:
         """A cell's images (rows of the network) and its sums."""
         ...
+
+    def some_sums(self, numbers: Sequence[int]) -> list[tuple[Index, Sums]]:
+        """Images and sums of cells."""
+        return [self.cell_sums(number) for number in numbers]
+
+    def kept(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What was made of this version under a key before, or else is made now. It must not be changed."""
+        return make()
 
     def sub_min(self, tile: int, images: Index | None) -> SubMin:
         """A tile's sub-MIN from its own cells and those that it shares, or its marginal on some images (ascending)."""
@@ -55,5 +73,4 @@ class NetworkSource(Protocol):
 
 def existing_cells(source: NetworkSource, tiles: Sequence[int]) -> tuple[int, ...]:
     """Distinct cells with points that any of these tiles holds, ascending."""
-    existing = set(source.cell_numbers())
-    return tuple(sorted({cell for tile in tiles for cell in source.cover.cells_held(tile)} & existing))
+    return source.existing(sorted({cell for tile in tiles for cell in source.cover.cells_held(tile)}))

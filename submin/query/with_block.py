@@ -7,7 +7,7 @@ what a run would make of the block differs by second-order terms and by blunders
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,7 @@ from submin.geodesy import geocentric_to_geodetic
 from submin.network.cell import Cell, RegisteredPoints, empty_cell, summed, with_rays
 from submin.network.low_rank import Fused, fuse, new_rays
 from submin.network.replay import joined
-from submin.network.sub_min import SubMin, add_sums
+from submin.network.sub_min import SubMin, add_sums, marginal
 from submin.query.block_control import both
 from submin.query.source import Index, NetworkSource, existing_cells
 from submin.tiling.cover import Cover
@@ -50,7 +50,7 @@ class BlockRays:
 
 
 @dataclass(frozen=True, eq=False)
-class TileWithBlock:
+class TileWithBlock(NetworkSource):
     """A tile with a block fused into it, as something to query: a `NetworkSource` whose cells and sub-MIN hold the block.
 
     Attributes
@@ -77,6 +77,11 @@ class TileWithBlock:
         """Cells that hold points, ascending."""
         return tuple(sorted({*self.source.cell_numbers(), *self.cells}))
 
+    def existing(self, numbers: Sequence[int]) -> tuple[int, ...]:
+        """Those of some cells that hold points, in their order."""
+        there = {*self.source.existing(numbers), *self.cells}
+        return tuple(number for number in numbers if number in there)
+
     def cell(self, number: int) -> Cell:
         """A cell without its sums."""
         return self.cells[number] if number in self.cells else self.source.cell(number)
@@ -92,12 +97,7 @@ class TileWithBlock:
         """The tile's sub-MIN with the block, or its marginal on some images."""
         if tile != self.tile:
             raise QueryError(f"the block was joined to tile {self.cover.tile_name(self.tile)} alone; ask the network for other tiles")
-        state, p = self.fused.sub_min, self.fused.sub_min.theta.shape[1]
-        if images is None:
-            return state
-        chosen = np.flatnonzero(np.isin(state.images, images))
-        rows = (chosen[:, None] * p + np.arange(p)).ravel()
-        return replace(state, images=state.images[chosen], theta=state.theta[chosen], covariance=state.covariance[np.ix_(rows, rows)])
+        return self.fused.sub_min if images is None else marginal(self.fused.sub_min, images)
 
     def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
         """None: a block is joined to what the tile itself holds."""
@@ -132,8 +132,7 @@ def with_block(source: NetworkSource, tile: int, block: BlockRays, elsewhere: Id
     """
     rows = np.arange(network_images, network_images + len(block.images), dtype=np.int32)
     image_set = partial(_image_set, source, block.images, network_images)
-    existing = set(source.cell_numbers())
-    held = [source.cell(number) for number in source.cover.cells_held(tile) if number in existing]
+    held = source.some_cells(existing_cells(source, [tile]))
     arrivals = {cell.number: np.isin(block.point_ids, cell.point_ids) for cell in held}
     here = np.any(list(arrivals.values()), axis=0) if arrivals else np.zeros(len(block.point_ids), dtype=np.bool_)
     new = ~here & ~np.isin(block.point_ids, elsewhere)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from submin import accuracy
 from submin.geodesy import geocentric_to_geodetic, local_axes, rotate_covariance
-from submin.network.sub_min import loadings, locate, point_covariances
+from submin.network.sub_min import covariances_of, locate
 from submin.query.planner import Rows, Selection, determined_parts, points_of_tile, ray_counts
 from submin.query.tile import tile_state
 from submin.storage.dense_reader import DenseReader
@@ -93,9 +93,7 @@ def _of_tile(network: Network, tile: int, selections: Sequence[Selection], day: 
     images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
     state = tile_state(network, tile, images)
     geodetic = geocentric_to_geodetic(np.concatenate([locate(part, state) for part in parts]), network.cover.ellipsoid)
-    own = np.concatenate([part.factors.own for part in parts])
-    covariance = point_covariances(loadings(parts, state.images, state.theta.shape[1]), own, state.covariance)
-    local = rotate_covariance(covariance, local_axes(geodetic))
+    local = rotate_covariance(np.concatenate([covariances_of(part, state) for part in parts]), local_axes(geodetic))
     return PointAccuracy(
         ids=np.concatenate([s.cell.point_ids[s.rows] for s in kept]),
         geodetic=geodetic,

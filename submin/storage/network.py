@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from datetime import date
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
@@ -20,11 +20,12 @@ from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
 from submin.network.cell import Cell
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.sub_min import SubMin
+from submin.network.sub_min import SubMin, marginal
 from submin.network.thinning import reported_points
 from submin.query.asked import Asked, few
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import PointsOfTile, cross_covariance, points_of_one_tile
+from submin.query.kept import Kept
 from submin.query.outside import UnionState, tiles_with_outside
 from submin.query.planner import (
     Answer,
@@ -37,10 +38,12 @@ from submin.query.planner import (
     well_spread,
 )
 from submin.query.point_metadata import PointMetadata, metadata_of_points
+from submin.query.source import NetworkSource
 from submin.storage.accuracy_map import PointAccuracy, accuracy_of, accuracy_of_all, accuracy_of_dense
 from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
+from submin.storage.directory import Directory
 from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.reconciled import ReconciledStore
@@ -50,10 +53,19 @@ from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
-CACHED_CELLS = 64
+T = TypeVar("T")
+KEPT_CELLS = 256 << 20
+"""Bytes of cells that are kept in memory."""
+KEPT_MERGES = 512 << 20
+"""Bytes of what was made of merged tiles that are kept in memory."""
+MOST_OF_A_TILE = 0.25
+"""Of a tile of which at least this part of the images is asked for, the whole is read and kept."""
+KEPT_IMAGES = 10_000
+PROBED = 200
+"""Up to so many cells are looked for by their names; a list of all of them costs more."""
 
 
-class Network:
+class Network(NetworkSource):
     """One version of a network, read only. It does not change while later versions are written; open it again to see them.
 
     Examples
@@ -74,10 +86,10 @@ class Network:
 
     def _begin(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
-        self._cells: OrderedDict[int, Cell] = OrderedDict()
+        self._cells: Kept[Cell] = Kept(KEPT_CELLS)
+        self._merges: Kept[Any] = Kept(KEPT_MERGES)
         self._images: dict[int, NetworkImage] = {}
-        self._numbers: tuple[int, ...] | None = None
-        self._tiles: frozenset[int] | None = None
+        self._exists: dict[int, bool] = {}
         self._dense = DenseReader(self._snapshot) if is_dense(self._snapshot) else None
         self._reconciled = ReconciledStore(snapshot, self._earlier)
         self._unions: dict[tuple[int, ...], UnionState] = {}
@@ -238,7 +250,7 @@ class Network:
             if not selections:
                 asked.refuse_swapped(self.cover)
         elif asked.points is not None:
-            selections, missing = points_named(self, asked.points, self._snapshot.candidate_cells(asked.points))
+            selections, missing = points_named(self, asked.points, self._directory.cells_of(asked.points))
             if len(missing):
                 raise QueryError(
                     f"{len(missing)} of {len(asked.points)} points are not in the network or not yet determined by two rays: {few(missing)}"
@@ -301,7 +313,7 @@ class Network:
         """
         refuse_dense(self._snapshot, "what is known of single points")
         ids = np.unique(np.asarray(points, dtype=np.str_))
-        selections, missing = points_named(self, ids, self._snapshot.candidate_cells(ids), every=True)
+        selections, missing = points_named(self, ids, self._directory.cells_of(ids), every=True)
         if len(missing):
             raise QueryError(f"{len(missing)} of {len(ids)} points are not in the network: {few(missing)}; expected ids of its points")
         return selections
@@ -346,7 +358,7 @@ class Network:
         if self._dense is not None:
             held = self._dense.held(ids)
             return {0: held} if len(held) else {}
-        selections, _ = points_named(self, ids, self._snapshot.candidate_cells(ids))
+        selections, _ = points_named(self, ids, self._directory.cells_of(ids))
         return {s.cell.number: s.cell.point_ids[s.rows] for s in selections}
 
     def cross_covariance(
@@ -376,7 +388,7 @@ class Network:
         return cross_covariance(self, first, second)
 
     def _points_of_tile(self, tile: int, ids: NDArray[np.str_]) -> PointsOfTile:
-        return points_of_one_tile(self, tile, ids, self._snapshot.candidate_cells(np.unique(ids)))
+        return points_of_one_tile(self, tile, ids, self._directory.cells_of(np.unique(ids)))
 
     def tile(self, name: str) -> TileView:
         """One sub-MIN alone."""
@@ -389,30 +401,54 @@ class Network:
 
     def cell_numbers(self) -> tuple[int, ...]:
         """Cells that hold points, ascending."""
-        if self._numbers is None:
-            self._numbers = self._snapshot.cell_numbers()
         return self._numbers
+
+    @cached_property
+    def _numbers(self) -> tuple[int, ...]:
+        return self._snapshot.cell_numbers()
+
+    def existing(self, numbers: Sequence[int]) -> tuple[int, ...]:
+        """Those of some cells that hold points, in their order."""
+        unknown = [number for number in numbers if number not in self._exists]
+        there = set(self._snapshot.existing_cells(unknown) if len(unknown) <= PROBED else self.cell_numbers())
+        self._exists.update((number, number in there) for number in unknown)
+        return tuple(number for number in numbers if self._exists[number])
 
     def cell(self, number: int) -> Cell:
         """A cell without its sums; the latest used ones are kept in memory."""
-        if number not in self._cells:
-            self._cells[number] = self._snapshot.cell(number, with_sums=False)
-            if len(self._cells) > CACHED_CELLS:
-                self._cells.popitem(last=False)
-        self._cells.move_to_end(number)
-        return self._cells[number]
+        return self.some_cells([number])[0]
+
+    def some_cells(self, numbers: Sequence[int]) -> list[Cell]:
+        """Cells without their sums; those that are not in memory are read side by side."""
+        found = {number: cell for number in numbers if (cell := self._cells.get(number)) is not None}
+        unread = [number for number in numbers if number not in found]
+        for number, cell in zip(unread, self._snapshot.cells(unread, with_sums=False) if unread else (), strict=True):
+            found[number] = self._cells.put(number, cell)
+        return [found[number] for number in numbers]
 
     def cell_sums(self, number: int) -> tuple[Index, Sums]:
         """A cell's images and sums."""
-        return self._snapshot.cell_sums(number)
+        return self.some_sums([number])[0]
+
+    def some_sums(self, numbers: Sequence[int]) -> list[tuple[Index, Sums]]:
+        """Images and sums of cells, read side by side."""
+        return self._snapshot.some_sums(numbers)
+
+    def kept(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What was made of this version under a key before, or else is made now; the latest used are kept in memory."""
+        found: T | None = self._merges.get(key)
+        return self._merges.put(key, make()) if found is None else found
 
     def sub_min(self, tile: int, images: Index | None) -> SubMin:
         """A tile's sub-MIN, or its marginal on some images."""
-        if self._tiles is None:
-            self._tiles = frozenset(self._snapshot.tile_numbers())
-        if tile not in self._tiles:
+        if not self._snapshot.has_tile(tile):
             raise QueryError(f"tile {self.cover.tile_name(tile)} holds nothing yet; see 'submin info'")
-        return self._snapshot.sub_min(tile, images)
+        whole: SubMin | None = self._merges.get(("tile", tile))
+        if whole is not None:
+            return whole if images is None else marginal(whole, images)
+        if images is None or len(images) < MOST_OF_A_TILE * len(self._snapshot.tile_images(tile)):
+            return self._snapshot.sub_min(tile, images)
+        return marginal(self._merges.put(("tile", tile), self._snapshot.sub_min(tile)), images)
 
     def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
         """State of some images from tiles and all that lies outside of them; None where the network cannot tell."""
@@ -423,15 +459,26 @@ class Network:
         return self.at(f"v{version}", self._snapshot.metadata.parameters)
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
-        """Images of these rows; every image is read once."""
+        """Images of these rows; the latest asked for are kept in memory."""
+        if len(self._images) > KEPT_IMAGES:
+            self._images.clear()
         unread = [int(row) for row in rows if int(row) not in self._images]
         self._images.update(zip(unread, self._snapshot.images(unread), strict=True))
         return image_set([self._images[int(row)] for row in rows], self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
 
+    @cached_property
+    def _blocks(self) -> NDArray[np.str_]:
+        """Block of every image."""
+        return np.asarray(self._snapshot.image_columns(["block_id"])["block_id"], dtype=np.str_)
+
+    @cached_property
+    def _directory(self) -> Directory:
+        return self._snapshot.directory()
+
     def control_set(self, found: Answer) -> ControlSet:
         """An answer as users get it; images behind it that are not in the network have no block there."""
         metadata, cover = self._snapshot.metadata, self.cover
-        blocks = self._snapshot.image_columns(["block_id"])["block_id"] if len(found.images) else np.empty(0, dtype="U1")
+        blocks = self._blocks if len(found.images) else np.empty(0, dtype="U1")
         return ControlSet(
             ids=found.ids,
             geocentric=found.geocentric,

@@ -24,19 +24,33 @@ from submin.errors import ConflictError, QueryError, StoreError
 from submin.network.cell import Cell, empty_cell, empty_sums, widened_sums
 from submin.network.network_image import NetworkImage, image_priors
 from submin.network.sub_min import SubMin
-from submin.storage.arrays import attributes_of, create_table, group_of, hash_ids, read_record, read_table, table_length
+from submin.storage.arrays import (
+    attributes_of,
+    create_table,
+    existing_groups,
+    group_of,
+    member_names,
+    read_record,
+    read_records,
+    read_spans,
+    read_table,
+    table_length,
+)
+from submin.storage.directory import Directory
 from submin.storage.place import is_remote, reason_of, storage_of, unreachable
 from submin.storage.schema import (
+    CELL_PARTS,
     CHANGE_COLUMNS,
     DIRECTORY_COLUMNS,
     FLAG_COLUMNS,
     IMAGE_COLUMNS,
     LEDGER_COLUMNS,
+    SUMS_PARTS,
     NetworkMetadata,
+    cell_of,
     network_images,
-    read_cell,
     read_sub_min,
-    read_sums_of,
+    sums_of,
     with_joint,
 )
 from submin.tiling.cover import Cover
@@ -221,24 +235,40 @@ class Snapshot:
 
     def cell(self, number: int, *, with_sums: bool = True) -> Cell:
         """A cell, empty when it has no points yet."""
-        name = "cells/" + self.cover.cell_name(number)
-        if name not in self.root:
-            return empty_cell(number, self.metadata.parameters)
-        return read_cell(group_of(self.root, name), self.metadata.parameters, with_sums=with_sums)
+        return self.cells([number], with_sums=with_sums)[0]
+
+    def cells(self, numbers: Sequence[int], *, with_sums: bool = True) -> list[Cell]:
+        """Cells, those empty that have no points yet; they are read side by side."""
+        names, parameters = map(self.cover.cell_name, numbers), self.metadata.parameters
+        records = read_records(group_of(self.root, "cells"), names, None if with_sums else CELL_PARTS)
+        return [
+            empty_cell(number, parameters) if record is None else cell_of(record, parameters, with_sums=with_sums)
+            for number, record in zip(numbers, records, strict=True)
+        ]
 
     def cell_sums(self, number: int) -> tuple[NDArray[np.int32], Sums]:
-        """A cell's images and sums, without its points and rays; nothing of a cell that has no points."""
-        name = "cells/" + self.cover.cell_name(number)
-        if name not in self.root:
-            return np.empty(0, dtype=np.int32), empty_sums(0, self.metadata.parameters)
-        group = group_of(self.root, name)
-        parts = read_record(group, ["images", "vector", "information"])
-        images = parts["images"].astype(np.int32)
-        return images, widened_sums(read_sums_of(group, parts), len(images), self.metadata.parameters)
+        """A cell's images (rows of the network) and sums, without its points and rays; nothing of a cell that has no points."""
+        return self.some_sums([number])[0]
+
+    def some_sums(self, numbers: Sequence[int]) -> list[tuple[NDArray[np.int32], Sums]]:
+        """Images and sums of cells as `cell_sums` has them, read side by side."""
+        parameters, found = self.metadata.parameters, []
+        for record in read_records(group_of(self.root, "cells"), map(self.cover.cell_name, numbers), SUMS_PARTS):
+            if record is None:
+                found.append((np.empty(0, dtype=np.int32), empty_sums(0, parameters)))
+            else:
+                images = record.parts["images"].astype(np.int32)
+                found.append((images, widened_sums(sums_of(record), len(images), parameters)))
+        return found
 
     def cell_numbers(self) -> tuple[int, ...]:
         """Cells that hold points or rays, ascending."""
-        return tuple(sorted(self.cover.cell_number(name) for name in group_of(self.root, "cells").group_keys()))
+        return tuple(sorted(map(self.cover.cell_number, member_names(group_of(self.root, "cells")))))
+
+    def existing_cells(self, numbers: Sequence[int]) -> tuple[int, ...]:
+        """Those of some cells that hold points or rays, without a list of all."""
+        there = existing_groups(group_of(self.root, "cells"), map(self.cover.cell_name, numbers))
+        return tuple(number for number, exists in zip(numbers, there, strict=True) if exists)
 
     def cell_attributes(self, number: int) -> dict[str, Any]:
         """Counts of a cell, without reading it."""
@@ -246,7 +276,11 @@ class Snapshot:
 
     def tile_numbers(self) -> tuple[int, ...]:
         """Tiles that have a sub-MIN, ascending."""
-        return tuple(sorted(self.cover.tile_number(name) for name in group_of(self.root, "tiles").group_keys()))
+        return tuple(sorted(map(self.cover.tile_number, member_names(group_of(self.root, "tiles")))))
+
+    def has_tile(self, tile: int) -> bool:
+        """Whether a tile has a sub-MIN."""
+        return existing_groups(group_of(self.root, "tiles"), [self.cover.tile_name(tile)])[0]
 
     def sub_min(self, tile: int, images: NDArray[np.int32] | None = None) -> SubMin:
         """A tile's sub-MIN, or its marginal on some images."""
@@ -273,9 +307,9 @@ class Snapshot:
         wanted_rows = np.asarray(rows, dtype=np.int64)
         found: list[NetworkImage] = []
         # a run of neighbours is one read of each column; a long gap between them is not read
-        for run in np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1):
-            span = network_images(read_table(table, wanted, int(run[0]), int(run[-1]) + 1))
-            found.extend(span[int(row) - int(run[0])] for row in run)
+        runs = np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1)
+        for run, columns in zip(runs, read_spans(table, wanted, [(int(run[0]), int(run[-1]) + 1) for run in runs]), strict=True):
+            found.extend(network_images({name: values[run - run[0]] for name, values in columns.items()}))
         return with_joint(self.root, found)
 
     def image_priors(self) -> tuple[ImagePrior, ...]:
@@ -299,16 +333,12 @@ class Snapshot:
 
     def candidate_cells(self, point_ids: NDArray[np.str_]) -> NDArray[np.int64]:
         """Cell (n,) in which each point would be, by the directory; -1 for points that are not in the network."""
-        directory = read_table(group_of(self.root, "directory"))
-        cells = np.full(len(point_ids), -1, dtype=np.int64)
-        if not len(directory["hash"]) or not len(point_ids):
-            return cells
-        wanted, inverse = np.unique(hash_ids(point_ids), return_inverse=True)
-        at = np.minimum(np.searchsorted(wanted, directory["hash"]), len(wanted) - 1)
-        hits = np.flatnonzero(wanted[at] == directory["hash"])
-        found = np.full(len(wanted), -1, dtype=np.int64)
-        found[at[hits]] = directory["cell"][hits]  # entries are in order of arrival, and the last assignment stays
-        return found[inverse]
+        return self.directory().cells_of(point_ids)
+
+    def directory(self) -> Directory:
+        """The directory of all points, 16 bytes each."""
+        columns = read_table(group_of(self.root, "directory"))
+        return Directory(columns["hash"], columns["cell"])
 
 
 def commit(session: icechunk.Session, version: int, message: str) -> None:

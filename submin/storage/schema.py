@@ -19,7 +19,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, widened
 from submin.network.network_image import JointPlace, NetworkImage
 from submin.network.sub_min import SubMin, wider
-from submin.storage.arrays import array_of, attributes_of, group_of, read_record, write_record
+from submin.storage.arrays import Record, array_of, attributes_of, group_of, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
 FORMAT_VERSION = 5
@@ -38,6 +38,9 @@ LEDGER_COLUMNS = {
 JOINT = "joint"
 """Group of the factors of correlated control, a record by content (`JointPlace.record`); views that were withdrawn keep theirs."""
 JOINT_CHUNK = 256
+CELL_PARTS = ("point_ids", "ray_point", "ray_image", "accepted", "images", "origin", "linearised_at", "theta", "observed", "sigma")
+"""What a cell's record holds, but for its sums."""
+SUMS_PARTS = ("images", "vector", "information")
 FLAG_COLUMNS = {"tile": "int64", "image": "int64"}
 """Which tile finds the camera of which image bad; the prior of an image is released while any tile says so."""
 DIRECTORY_COLUMNS = {"hash": "uint64", "cell": "int64"}
@@ -124,25 +127,27 @@ def determined(cell: Cell) -> NDArray[np.bool_]:
 
 def read_cell(group: zarr.Group, parameters: int, *, with_sums: bool = True) -> Cell:
     """The cell of a record, with so many parameters an image; without sums (left empty) the large part is not read."""
-    wanted = [
-        "point_ids", "ray_point", "ray_image", "accepted", "images", "origin", "linearised_at", "theta", "observed", "sigma",
-    ]  # fmt: skip
-    parts = read_record(group, None if with_sums else wanted)
+    return cell_of(Record(attributes_of(group), read_record(group, None if with_sums else CELL_PARTS)), parameters, with_sums=with_sums)
+
+
+def cell_of(record: Record, parameters: int, *, with_sums: bool) -> Cell:
+    """The cell of a record as it was read, with so many parameters an image; without sums these are left empty."""
+    parts = record.parts
     rays = Rays(
         parts["ray_point"].astype(np.int32), parts["ray_image"].astype(np.int32), parts["observed"], parts["sigma"],
         parts["accepted"].astype(np.bool_),
     )  # fmt: skip
-    sums = read_sums_of(group, parts) if with_sums else Sums(np.empty((0, 0)), np.empty(0), 0.0, 0)
+    sums = sums_of(record) if with_sums else Sums(np.empty((0, 0)), np.empty(0), 0.0, 0)
     cell = Cell(
-        int(attributes_of(group)["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"],
+        int(record.attributes["number"]), parts["point_ids"], parts["origin"], parts["linearised_at"],
         parts["images"].astype(np.int32), parts["theta"], rays, sums,
     )  # fmt: skip
     return widened(cell, parameters)
 
 
-def read_sums_of(group: zarr.Group, parts: dict[str, NDArray[Any]]) -> Sums:
+def sums_of(record: Record) -> Sums:
     """Sums among the parts of a cell's record."""
-    attributes = attributes_of(group)
+    parts, attributes = record.parts, record.attributes
     return Sums(unpacked(parts["information"]), parts["vector"], float(attributes["misclosure"]), int(attributes["redundancy"]))
 
 

@@ -321,11 +321,16 @@ class Cover:
 
     def cell_number(self, name: str) -> int:
         """Cell of a name; raises `InputError` when there is none."""
-        owner = self.tile_number(name.split("+")[0])
-        for cell in self.cells_owned(owner):
-            if self.cell_name(cell) == name:
-                return cell
-        raise InputError(f"cell is {name!r}; expected one of {', '.join(map(self.cell_name, self.cells_owned(owner)))}")
+        first = name.split("+")[0]
+        if first not in self._cell_memory:
+            self._cell_memory[first] = {self.cell_name(cell): cell for cell in self.cells_owned(self.tile_number(first))}
+        if name not in self._cell_memory[first]:
+            raise InputError(f"cell is {name!r}; expected one of {', '.join(self._cell_memory[first])}")
+        return self._cell_memory[first][name]
+
+    @cached_property
+    def _cell_memory(self) -> dict[str, dict[str, int]]:
+        return {}
 
     def depth(self, tile: int, longitude: Array, latitude: Array) -> Array:
         """Distance (n,) in metres from positions to the tile's outline, positive inside; rim sides are infinitely far."""
@@ -352,6 +357,37 @@ class Cover:
     def tile_bounds(self, tile: int) -> tuple[float, float, float, float]:
         """West, south, east, north of a tile in the plane, metres; tiles on the rim reach to infinity."""
         return self._bounds(tile, 0.5 * self.overlap, open_rim=True)
+
+    def cell_bounds(self, cell: int) -> tuple[float, float, float, float]:
+        """West, south, east, north of the box around a cell in the plane, metres; cells on the rim reach to infinity."""
+        tile, zone = divmod(int(cell), ZONES**2)
+        first = np.array(self._zones(tile)[0]).reshape(ZONES, ZONES) == zone
+        rows, columns = np.flatnonzero(first.any(axis=1)), np.flatnonzero(first.any(axis=0))
+        west, south, east, north = self.core_bounds(tile)
+        x, y, _, _ = self._bounds(tile, 0.0)
+        into = [0.0, *map(float, self._lines(self.side(tile)))]
+        # the first and the last strip end where the core does, which may be nowhere
+        return (
+            west if columns[0] == 0 else x + into[columns[0]],
+            south if rows[0] == 0 else y + into[rows[0]],
+            east if columns[-1] == ZONES - 1 else x + into[columns[-1] + 1],
+            north if rows[-1] == ZONES - 1 else y + into[rows[-1] + 1],
+        )
+
+    def tiles_meeting(self, west: float, south: float, east: float, north: float) -> Iterator[int]:
+        """Tiles whose core meets a box in the plane, metres."""
+        rows = self._range(south, north, self.origin[1], self.rows)
+        columns = self._range(west, east, self.origin[0], self.columns)
+        for tile in (row * self.columns + column for row in rows for column in columns):
+            for leaf in self.leaves_of(tile):
+                w, s, e, n = self.core_bounds(leaf)
+                if w <= east and e >= west and s <= north and n >= south:
+                    yield leaf
+
+    def _range(self, low: float, high: float, origin: float, count: int) -> range:
+        """Rows or columns of cores that meet an interval; those on the rim reach to infinity."""
+        first, last = np.clip(np.floor((np.array([low, high]) - origin) / self.core), 0, count - 1)
+        return range(int(first), int(last) + 1)
 
     def core_outline(self, tile: int) -> Array:
         """Outline (5, 2) of a core in the plane, metres, closed."""

@@ -38,7 +38,7 @@ BLOCK = "T001-001"
 
 
 @dataclass(frozen=True)
-class Without:
+class Without(NetworkSource):
     """A network as if some of its images had never brought a ray, linearised where it is with them."""
 
     network: Network

@@ -15,7 +15,7 @@ from submin.adjustment.elimination import LinearRays, Sums, eliminate, point_fac
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori, ImagePrior, prior_factor
 from submin.network import sub_min as module
-from submin.network.sub_min import GroundPart, SubMin, add_sums, factor, joint_covariance, loadings, locate, point_covariances
+from submin.network.sub_min import GroundPart, SubMin, add_sums, covariances_of, factor, joint_covariance, loadings, locate, marginal
 from submin.sensors import sensor_named
 
 Array = NDArray[np.float64]
@@ -231,7 +231,8 @@ def test_point_covariances_are_the_blocks_of_the_joint_one() -> None:
     sums, ground = part_of(rays, np.ones(rays.points, dtype=np.bool_))
     sub_min = sub_min_of([sums])
     loading = loadings([ground], sub_min.images, P)
-    blocks = point_covariances(loading, ground.factors.own, sub_min.covariance)
+    blocks = covariances_of(ground, sub_min)
+    np.testing.assert_array_equal(blocks, np.swapaxes(blocks, 1, 2))
     for start in (0, 2040, 2990):
         rows = slice(3 * start, 3 * start + 30)
         joint = joint_covariance(loading[rows], ground.factors.own[start : start + 10], sub_min.covariance)
@@ -239,15 +240,15 @@ def test_point_covariances_are_the_blocks_of_the_joint_one() -> None:
             assert_close(blocks[start + k], joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], 1e-12)
 
 
-def test_point_covariances_of_loadings_on_other_images_by_coordinate() -> None:
-    rng = np.random.default_rng(3)
-    root = rng.normal(size=(12, 12))
-    covariance, own = root @ root.T, np.tile(np.eye(3), (5, 1, 1))
-    loading = sp.random_array((15, 12), density=0.4, rng=rng, format="csr")
-    joint = joint_covariance(loading, own, covariance)
-    blocks = point_covariances(loading, own, covariance)
-    for k in range(5):
-        assert_close(blocks[k], joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], 1e-12)
+def test_a_marginal_is_that_of_the_images_that_are_there() -> None:
+    rays = random_rays(6)
+    sums, _ = part_of(rays, np.ones(rays.points, dtype=np.bool_))
+    whole = sub_min_of([sums])
+    part = marginal(whole, np.array([*whole.images[1:3], whole.images[-1] + 7], dtype=np.int32))
+    np.testing.assert_array_equal(part.images, whole.images[1:3])
+    np.testing.assert_array_equal(part.theta, whole.theta[1:3])
+    np.testing.assert_array_equal(part.covariance, whole.covariance[P : 3 * P, P : 3 * P])
+    assert marginal(whole, whole.images) is whole
 
 
 def test_a_query_of_some_points_is_the_marginal_of_all() -> None:

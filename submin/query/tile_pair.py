@@ -1,0 +1,95 @@
+"""Two padded tiles in the axes that diagonalise both: every weighted intersection of theirs is then a sum of scaled squares.
+
+With ``Lambda_1 + Lambda_2 = L L'`` and ``L^-1 Lambda_2 L^-T = V diag(mu) V'``, the columns of ``B = L^-T V`` are such axes:
+
+    B' Lambda_1 B = diag(1 - mu),    B' Lambda_2 B = diag(mu)
+    ((1 - w) Lambda_1 + w Lambda_2)^-1 = B diag(1 / d) B',    d = (1 - w)(1 - mu) + w mu
+
+One factorisation serves every question to the pair (docs/mathematics.md, "Covariance Intersection
+and bounded inflation in parameter space").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from submin.adjustment.estimation import cholesky
+from submin.network.sub_min import GroundPart, SubMin, loadings
+from submin.query.padded_tiles import PaddedTiles
+from submin.query.source import Index
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TilePair:
+    """Two tiles in their common axes.
+
+    Attributes
+    ----------
+    rows : (m,) rows of the network's images, ascending
+    reach : (m p, q) ``K B``: the image parameters along the axes
+    share : (q,) mu, what the second tile has of the information along each axis
+    vector : (2, q) ``B' K' h_t``
+    """
+
+    rows: Index
+    reach: Array
+    share: Array
+    vector: Array
+
+    @classmethod
+    def of(cls, padded: PaddedTiles) -> TilePair:
+        """The axes of two padded tiles."""
+        first, second = padded.common(0), padded.common(1)
+        lower = cholesky(first + second)
+        half = la.solve_triangular(lower, second, lower=True)
+        share, axes = la.eigh(la.solve_triangular(lower, half.T, lower=True), overwrite_a=True, driver="evd")
+        axes = la.solve_triangular(lower, axes, lower=True, trans=1, overwrite_b=True)
+        # neither tile knows less than the priors, whatever round-off says: Lambda >= I
+        least = np.einsum("ij,ij->j", axes, axes)
+        vector = padded.holds.T.astype(np.float64) @ padded.vector
+        return cls(padded.rows, np.ascontiguousarray(padded.prior @ axes), np.clip(share, least, 1.0 - least), vector @ axes)
+
+    @property
+    def parameters(self) -> int:
+        """Parameters p of an image."""
+        return len(self.reach) // len(self.rows)
+
+    def squares(self, parts: Sequence[GroundPart]) -> Array:
+        """Sums of squares (q,) of the coordinates of some points along each axis: the trace of their covariance is ``sum squares / d``."""
+        seen = loadings(parts, self.rows, self.parameters)
+        if seen.shape[0] <= seen.shape[1]:
+            along = seen @ self.reach
+            return np.asarray(np.einsum("ij,ij->j", along, along))
+        return np.asarray(np.einsum("ij,ij->j", self.reach, sp.csr_array(seen.T @ seen) @ self.reach))
+
+    def information(self, weight: float) -> Array:
+        """D (q,): information along each axis when the second tile has this weight, 0 to 1."""
+        return np.asarray((1.0 - weight) * (1.0 - self.share) + weight * self.share)
+
+    def weight(self, squares: Array) -> float:
+        """Weight of the second tile by which the trace ``sum squares / d``, a convex function of it, is least."""
+
+        def slope(weight: float) -> float:
+            return float(squares @ ((1.0 - 2.0 * self.share) / self.information(weight) ** 2))
+
+        if slope(0.0) >= 0.0:
+            return 0.0
+        return 1.0 if slope(1.0) <= 0.0 else float(brentq(slope, 0.0, 1.0, xtol=1e-12))
+
+    def state(self, weight: float, images: Index) -> SubMin:
+        """The images that are among ``images`` (ascending), from both tiles by a weight of the second. A merge has no chi-square."""
+        chosen, p = np.flatnonzero(np.isin(self.rows, images)), self.parameters
+        reach = self.reach[(chosen[:, None] * p + np.arange(p)).ravel()]
+        information = self.information(weight)
+        theta = reach @ (((1.0 - weight) * self.vector[0] + weight * self.vector[1]) / information)
+        half = reach / np.sqrt(information)
+        return SubMin(self.rows[chosen], theta.reshape(len(chosen), p), half @ half.T, float("nan"), 0, behind=self.rows)
