@@ -21,6 +21,7 @@ from benchmarks import (
     faults,
     five_blocks,
     main_job,
+    query,
     stage_one,
     sub_min,
     worldview,
@@ -34,6 +35,7 @@ BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "stage-1": ("projection, and a triplet through stage 1: fast, and linear in rays", stage_one.measure),
     "dense-update": ("a dense network's update in the time of BLAS's own; a thousand updates lose no digits", dense_update.measure),
     "sub-min": ("memory of a sub-MIN, a batch on one thread, low-rank update against factorisation, drift", sub_min.measure),
+    "query": ("small questions to a network of 500,000 points: joint covariances in one tile and across two, maps", query.measure),
     "faults": ("a run whose processes are killed leaves the network of an undisturbed one", faults.measure),
     "cluster": ("what a run costs beside its tasks: scheduler, coordinator and store", cluster.measure),
     "five-blocks": ("Tables 2 and 3 of the 2008 paper; sequential = simultaneous; consistent", five_blocks.measure),
@@ -57,6 +59,7 @@ def command(
     workers: Annotated[int, typer.Option(help="Worker processes.")] = 2,
     kills: Annotated[int | None, typer.Option(min=1, help="faults: number of kills.")] = None,
     seed: Annotated[int | None, typer.Option(help="faults: seed of the moments; default: drawn, and said.")] = None,
+    network: Annotated[Path | None, typer.Option(help="query: a network that is there already, in place of a new one.")] = None,
     figures: Annotated[
         Path | None, typer.Option("--out", help="five-blocks, worldview, correlation, continuity: folder for figures.")
     ] = None,
@@ -73,6 +76,10 @@ def command(
     more: dict[str, Any] = {option: value for option, value in (("kills", kills), ("seed", seed)) if value is not None}
     if more and name != "faults":
         raise typer.BadParameter(f"--{next(iter(more))} is an option of faults")
+    if network is not None:
+        if name != "query":
+            raise typer.BadParameter("--network is an option of query")
+        more["network"] = network
     if figures is not None:
         if name not in WITH_FIGURES:
             raise typer.BadParameter(f"--out is an option of {', '.join(WITH_FIGURES)}")

@@ -38,7 +38,7 @@ def estimate(source: NetworkSource, tiles: Sequence[int], images: Index, parts: 
     """
     if len(tiles) == 2:
         pair = source.kept(("pair", tuple(tiles)), lambda: TilePair.of(padded_tiles(source, tiles)))
-        return pair.state(pair.weight(pair.squares(parts)), images)
+        return pair.state(pair.weights(pair.squares(parts)), images)
     padded = padded_tiles(source, tiles)
     weights = np.ones(1) if len(tiles) == 1 else intersection_weights(padded.of_tiles, padded.functionals(parts))
     return padded.weighted(padded.holds @ weights, 1.0)

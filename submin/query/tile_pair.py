@@ -71,25 +71,26 @@ class TilePair:
             return np.asarray(np.einsum("ij,ij->j", along, along))
         return np.asarray(np.einsum("ij,ij->j", self.reach, sp.csr_array(seen.T @ seen) @ self.reach))
 
-    def information(self, weight: float) -> Array:
-        """D (q,): information along each axis when the second tile has this weight, 0 to 1."""
-        return np.asarray((1.0 - weight) * (1.0 - self.share) + weight * self.share)
+    def information(self, weights: Array) -> Array:
+        """Information d (q,) along each axis with weights (2,) of the tiles."""
+        return np.asarray(weights[0] * (1.0 - self.share) + weights[1] * self.share)
 
-    def weight(self, squares: Array) -> float:
-        """Weight of the second tile by which the trace ``sum squares / d``, a convex function of it, is least."""
+    def weights(self, squares: Array) -> Array:
+        """Weights (2,) on the simplex by which the trace ``sum squares / d``, a convex function of them, is least."""
 
-        def slope(weight: float) -> float:
-            return float(squares @ ((1.0 - 2.0 * self.share) / self.information(weight) ** 2))
+        def slope(second: float) -> float:
+            return float(squares @ ((1.0 - 2.0 * self.share) / self.information(np.array([1.0 - second, second])) ** 2))
 
         if slope(0.0) >= 0.0:
-            return 0.0
-        return 1.0 if slope(1.0) <= 0.0 else float(brentq(slope, 0.0, 1.0, xtol=1e-12))
+            return np.array([1.0, 0.0])
+        second = 1.0 if slope(1.0) <= 0.0 else float(brentq(slope, 0.0, 1.0, xtol=1e-12))
+        return np.array([1.0 - second, second])
 
-    def state(self, weight: float, images: Index) -> SubMin:
-        """The images that are among ``images`` (ascending), from both tiles by a weight of the second. A merge has no chi-square."""
+    def state(self, weights: Array, images: Index) -> SubMin:
+        """Those images that are among ``images`` (ascending), from both tiles with weights (2,). A merge has no chi-square."""
         chosen, p = np.flatnonzero(np.isin(self.rows, images)), self.parameters
         reach = self.reach[(chosen[:, None] * p + np.arange(p)).ravel()]
-        information = self.information(weight)
-        theta = reach @ (((1.0 - weight) * self.vector[0] + weight * self.vector[1]) / information)
+        information = self.information(weights)
+        theta = reach @ ((weights @ self.vector) / information)
         half = reach / np.sqrt(information)
         return SubMin(self.rows[chosen], theta.reshape(len(chosen), p), half @ half.T, float("nan"), 0, behind=self.rows)

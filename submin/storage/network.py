@@ -58,8 +58,6 @@ KEPT_CELLS = 256 << 20
 """Bytes of cells that are kept in memory."""
 KEPT_MERGES = 512 << 20
 """Bytes of what was made of merged tiles that are kept in memory."""
-MOST_OF_A_TILE = 0.25
-"""Of a tile of which at least this part of the images is asked for, the whole is read and kept."""
 KEPT_IMAGES = 10_000
 PROBED = 200
 """Up to so many cells are looked for by their names; a list of all of them costs more."""
@@ -90,6 +88,7 @@ class Network(NetworkSource):
         self._merges: Kept[Any] = Kept(KEPT_MERGES)
         self._images: dict[int, NetworkImage] = {}
         self._exists: dict[int, bool] = {}
+        self._tiles: set[int] = set()
         self._dense = DenseReader(self._snapshot) if is_dense(self._snapshot) else None
         self._reconciled = ReconciledStore(snapshot, self._earlier)
         self._unions: dict[tuple[int, ...], UnionState] = {}
@@ -440,15 +439,16 @@ class Network(NetworkSource):
         return self._merges.put(key, make()) if found is None else found
 
     def sub_min(self, tile: int, images: Index | None) -> SubMin:
-        """A tile's sub-MIN, or its marginal on some images."""
-        if not self._snapshot.has_tile(tile):
-            raise QueryError(f"tile {self.cover.tile_name(tile)} holds nothing yet; see 'submin info'")
+        """A tile's sub-MIN, or its marginal on some images; of a tile that is asked for again the whole is kept in memory."""
         whole: SubMin | None = self._merges.get(("tile", tile))
-        if whole is not None:
-            return whole if images is None else marginal(whole, images)
-        if images is None or len(images) < MOST_OF_A_TILE * len(self._snapshot.tile_images(tile)):
-            return self._snapshot.sub_min(tile, images)
-        return marginal(self._merges.put(("tile", tile), self._snapshot.sub_min(tile)), images)
+        if whole is None:
+            if tile not in self._tiles and not self._snapshot.has_tile(tile):
+                raise QueryError(f"tile {self.cover.tile_name(tile)} holds nothing yet; see 'submin info'")
+            if images is None or tile not in self._tiles:
+                self._tiles.add(tile)
+                return self._snapshot.sub_min(tile, images)
+            whole = self._merges.put(("tile", tile), self._snapshot.sub_min(tile))
+        return whole if images is None else marginal(whole, images)
 
     def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
         """State of some images from tiles and all that lies outside of them; None where the network cannot tell."""

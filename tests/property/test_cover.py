@@ -391,6 +391,26 @@ def test_cores_on_the_rim_reach_to_infinity(cover: Cover, seed: int, beyond: flo
         assert cell in cover.cells_owned(owner[0])
 
 
+@EXAMPLES
+@given(covers(), st.integers(0, 2**32 - 1))
+def test_the_box_around_a_cell_holds_it(cover: Cover, seed: int) -> None:
+    east, north = places(cover, seed)
+    for cell, x, y in zip(cover.cells_of(*cover.geographic(east, north)).tolist(), east, north, strict=True):
+        w, s, e, n = cover.cell_bounds(cell)
+        assert w <= x <= e and s <= y <= n
+        west, south, e_core, n_core = cover.core_bounds(Cover.owner(cell))
+        assert west <= w < e <= e_core and south <= s < n <= n_core
+
+
+@EXAMPLES
+@given(covers(), st.integers(0, 2**32 - 1))
+def test_tiles_that_meet_a_box_are_those_with_a_place_in_it(cover: Cover, seed: int) -> None:
+    (west, east), (south, north) = (np.sort(axis[:2]) for axis in places(cover, seed))
+    tiles, bounds = outlines_of(cover, 0.0)
+    meet = (bounds[:, 0] <= east) & (bounds[:, 2] >= west) & (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
+    assert sorted(cover.tiles_meeting(west, south, east, north)) == sorted(tiles[meet].tolist())
+
+
 # Examples
 
 

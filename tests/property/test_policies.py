@@ -33,11 +33,15 @@ from shapely.geometry.base import BaseGeometry
 import submin
 from submin.adjustment.priors import APriori
 from submin.errors import QueryError
+from submin.network.sub_min import marginal
 from submin.query import bounded_inflation, covariance_intersection, split_intersection
 from submin.query.bounded_inflation import inflation
 from submin.query.control_set import ControlSet
 from submin.query.covariance_intersection import intersection_weights
-from submin.query.planner import POLICIES
+from submin.query.padded_tiles import padded_tiles
+from submin.query.planner import POLICIES, determined_parts, points_in_area
+from submin.query.source import existing_cells
+from submin.query.tile_pair import TilePair
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.network import Network
 from submin.storage.simulated import write_region
@@ -145,21 +149,20 @@ def places(problem: Equations) -> dict[str, Ids]:
     return {name: problem.point_ids[chosen] for name, chosen in found.items()}
 
 
-CHOICES = {
-    "ci": (covariance_intersection, "intersection_weights"),
-    "bci": (bounded_inflation, "inflation"),
-    "split": (split_intersection, "split_weights"),
+CHOICES: dict[str, list[tuple[object, str]]] = {
+    "ci": [(covariance_intersection, "intersection_weights"), (TilePair, "weights")],
+    "bci": [(bounded_inflation, "inflation")],
+    "split": [(split_intersection, "split_weights")],
 }
-"""What a policy chooses for a query, and where."""
+"""What a policy chooses for a query, and where; of two tiles `ci` chooses by itself."""
 
 
 def asked(made: Made, policy: str, monkeypatch: pytest.MonkeyPatch, **question: object) -> tuple[ControlSet, Array]:
     """An answer, and the weights or scales that the policy chose for it (1 where it chose none)."""
     chosen = [np.ones(1)]
-    if policy in CHOICES:
-        module, name = CHOICES[policy]
+    for module, name in CHOICES.get(policy, []):
         choose = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda *arguments: chosen.append(choose(*arguments)) or chosen[-1])
+        monkeypatch.setattr(module, name, lambda *arguments, choose=choose: chosen.append(choose(*arguments)) or chosen[-1])
     return made.network.query(policy=policy, **question), chosen[-1]  # type: ignore[arg-type]
 
 
@@ -293,6 +296,36 @@ def test_intersection_is_never_worse_than_its_best_tile(overlapping: Made) -> No
     alone = [np.trace(overlapping.network.query(points=ids, tile=tile).covariance) for tile in merged.tiles]
     everything = np.trace(overlapping.network.query(points=ids, policy="rigorous").covariance)
     assert everything <= np.trace(merged.covariance) <= min(alone) * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("second", [0.0, 0.3, 1.0])
+def test_a_pair_of_tiles_is_what_its_weights_make_of_both(made: Made, second: float) -> None:
+    network, tiles = made.network, (0, 1)
+    padded = padded_tiles(network, tiles)
+    pair, weights = TilePair.of(padded), np.array([1.0 - second, second])
+    _, parts = determined_parts(network, points_in_area(network, made.area)[:2])
+    images = np.unique(np.concatenate([part.linear.image for part in parts]))[1:].astype(np.int32)
+    found, expected = pair.state(weights, images), marginal(padded.weighted(padded.holds @ weights, 1.0), images)
+    np.testing.assert_array_equal(found.images, expected.images)
+    np.testing.assert_array_equal(found.behind, padded.rows)
+    sigma = np.sqrt(np.diag(expected.covariance))
+    assert (np.abs(found.covariance - expected.covariance) / sigma / sigma[:, None]).max() < 1e-9
+    assert (np.abs(found.theta - expected.theta).ravel() / sigma).max() < 1e-9
+    squares, functionals = pair.squares(parts), padded.functionals(parts)
+    assert (squares / pair.information(weights)).sum() == pytest.approx(trace_of(weights, padded.of_tiles, functionals), rel=1e-9)
+    best = pair.weights(squares)
+    searched = intersection_weights(padded.of_tiles, functionals)
+    assert best.sum() == 1.0 and best.min() >= 0.0
+    assert trace_of(best, padded.of_tiles, functionals) <= trace_of(searched, padded.of_tiles, functionals) * (1.0 + 1e-9)
+
+
+def test_few_and_many_points_have_the_same_squares(overlapping: Made) -> None:
+    network, pair = overlapping.network, TilePair.of(padded_tiles(overlapping.network, (0, 1)))
+    held = existing_cells(network, (0, 1))
+    _, parts = determined_parts(network, [s for s in points_in_area(network, overlapping.area) if s.cell.number in held])
+    one_by_one = [pair.squares([part]) for part in parts]
+    assert 3 * sum(len(part.origin) for part in parts) > len(pair.reach) > 3 * len(parts[0].origin)
+    np.testing.assert_allclose(pair.squares(parts), np.sum(one_by_one, axis=0), rtol=1e-9)
 
 
 def test_intersection_of_one_tile_is_the_tile(overlapping: Made) -> None:
