@@ -18,9 +18,13 @@ from submin.storage.arrays import (
     create_table,
     decode_text,
     encode_text,
+    existing_groups,
     group_of,
     hash_ids,
+    member_names,
     read_record,
+    read_records,
+    read_spans,
     read_table,
     replace_table,
     set_rows,
@@ -275,3 +279,40 @@ def test_hash_of_an_id_does_not_depend_on_its_company(texts: NDArray[np.str_]) -
     assert hash_ids(texts).tolist() == [fnv1a(str(text)) for text in texts]
     for text in texts:
         assert hash_ids(np.array([text])).tolist() == [fnv1a(str(text))]
+
+
+# Side by side
+
+
+def test_records_are_read_side_by_side_and_missing_ones_told() -> None:
+    parent = root().create_group("cells")
+    for k in range(5):
+        write_record(parent, f"c{k}", {"ids": np.array([f"p{k}", "q"]), "values": np.full(k, 0.5), "count": np.arange(3)}, {"number": k})
+    names = ["c3", "none", "c0", "c4"]
+    found = read_records(parent, names)
+    assert [record is None for record in found] == [False, True, False, False]
+    for name, record in zip(names, found, strict=True):
+        if record is not None:
+            assert_same(dict(record.parts), read_record(group_of(parent, name)))
+            assert record.attributes["number"] == int(name[1:])
+    (some,) = read_records(parent, ["c3"], ["ids"])
+    assert some is not None and set(some.parts) == {"ids"}
+    assert existing_groups(parent, names) == [True, False, True, True]
+    assert member_names(parent) == [f"c{k}" for k in range(5)]
+    assert read_records(parent, []) == [] and existing_groups(parent, []) == []
+
+
+def test_a_record_that_is_an_array_is_damage() -> None:
+    parent = root()
+    parent.create_array("c0", data=np.arange(3))
+    with pytest.raises(StoreError, match="has an array 'c0'"):
+        read_records(parent, ["c0"])
+
+
+def test_spans_are_what_each_by_itself_is() -> None:
+    table = create_table(root(), "images", {"name": "text", "value": "float64"})
+    append_table(table, {"name": np.array([f"n{k}" * (k % 4) for k in range(50)]), "value": np.arange(50.0)})
+    spans: list[tuple[int, int | None]] = [(0, 3), (7, 8), (40, None), (12, 12), (48, 60)]
+    for span, found in zip(spans, read_spans(table, ["value", "name"], spans), strict=True):
+        assert_same(found, read_table(table, ["value", "name"], *span))
+        assert_same(found, {name: values[span[0] : span[1]] for name, values in read_table(table).items()})
