@@ -47,6 +47,7 @@ from submin.storage.directory import Directory
 from submin.storage.image_facts import image_facts
 from submin.storage.network_store import Snapshot
 from submin.storage.reconciled import ReconciledStore
+from submin.storage.schema import with_joint
 from submin.storage.tile_view import TileView
 from submin.storage.validity import Validity, today
 from submin.tiling.cover import Cover
@@ -58,6 +59,8 @@ KEPT_CELLS = 256 << 20
 """Bytes of cells that are kept in memory."""
 KEPT_MERGES = 512 << 20
 """Bytes of what was made of merged tiles that are kept in memory."""
+IMAGE_PAGE = 64
+"""So many neighbours in the image table are read together."""
 KEPT_IMAGES = 10_000
 PROBED = 200
 """Up to so many cells are looked for by their names; a list of all of them costs more."""
@@ -86,6 +89,7 @@ class Network(NetworkSource):
         self._snapshot = snapshot
         self._cells: Kept[Cell] = Kept(KEPT_CELLS)
         self._merges: Kept[Any] = Kept(KEPT_MERGES)
+        self._plain_images: dict[int, NetworkImage] = {}
         self._images: dict[int, NetworkImage] = {}
         self._exists: dict[int, bool] = {}
         self._tiles: set[int] = set()
@@ -460,10 +464,17 @@ class Network(NetworkSource):
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         """Images of these rows; the latest asked for are kept in memory."""
-        if len(self._images) > KEPT_IMAGES:
+        if len(self._plain_images) > KEPT_IMAGES:
+            self._plain_images.clear()
             self._images.clear()
         unread = [int(row) for row in rows if int(row) not in self._images]
-        self._images.update(zip(unread, self._snapshot.images(unread), strict=True))
+        pages = {row // IMAGE_PAGE for row in unread if row not in self._plain_images}
+        if pages:  # neighbours are asked for next, and lie in the chunks that are read anyway
+            near = np.concatenate([np.arange(IMAGE_PAGE * page, IMAGE_PAGE * (page + 1)) for page in sorted(pages)])
+            near = near[near < self._snapshot.image_count()]
+            self._plain_images.update(zip(near.tolist(), self._snapshot.plain_images(near), strict=True))
+        images = with_joint(self._snapshot.root, [self._plain_images[row] for row in unread])
+        self._images.update(zip(unread, images, strict=True))
         return image_set([self._images[int(row)] for row in rows], self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
 
     @cached_property

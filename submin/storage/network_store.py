@@ -296,12 +296,12 @@ class Snapshot:
 
     def images(self, rows: Sequence[int] | NDArray[np.integer] | None = None) -> list[NetworkImage]:
         """Images of these rows (ascending), or all."""
-        table, wanted = (
-            group_of(self.root, "images"),
-            [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")],
-        )
-        if rows is None:
-            return with_joint(self.root, network_images(read_table(table, wanted)))
+        return with_joint(self.root, self.plain_images(np.arange(self.image_count()) if rows is None else rows))
+
+    def plain_images(self, rows: Sequence[int] | NDArray[np.integer]) -> list[NetworkImage]:
+        """Images of these rows (ascending), views of correlated control without their rows of the common factor (`with_joint`)."""
+        table = group_of(self.root, "images")
+        wanted = [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")]
         if not len(rows):
             return []
         wanted_rows = np.asarray(rows, dtype=np.int64)
@@ -310,7 +310,7 @@ class Snapshot:
         runs = np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1)
         for run, columns in zip(runs, read_spans(table, wanted, [(int(run[0]), int(run[-1]) + 1) for run in runs]), strict=True):
             found.extend(network_images({name: values[run - run[0]] for name, values in columns.items()}))
-        return with_joint(self.root, found)
+        return found
 
     def image_priors(self) -> tuple[ImagePrior, ...]:
         """What is believed a priori of every image, by row; cameras are not read."""
