@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from benchmarks.linear_estimates import MERGED, LinearEstimate, alone, cross_covariance
 from submin.accuracy import ce90, le90
 from submin.geodesy import geocentric_to_geodetic, local_axes, rotate_covariance
-from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate, point_covariances
+from submin.network.sub_min import GroundPart, SubMin, covariances_of, joint_covariance, loadings, locate
 from submin.query import rigorous
 from submin.query.control_set import ControlSet
 from submin.query.padded_tiles import PaddedTiles, padded_tiles
@@ -306,12 +306,8 @@ def sheets(network: Network, whole: SubMin, policy: str) -> Iterator[Sheets]:
         else:
             concerned: Sequence[int] = sorted({t for s in kept for t in cover.holders(s.cell.number)})
             state = rigorous.estimate(network, concerned, np.empty(0, dtype=np.int32), parts)
-        own = np.concatenate([part.factors.own for part in parts])
         by_state = [
-            (
-                np.concatenate([locate(part, s) for part in parts]),
-                point_covariances(loadings(parts, s.images, s.theta.shape[1]), own, s.covariance),
-            )
+            (np.concatenate([locate(part, s) for part in parts]), np.concatenate([covariances_of(part, s) for part in parts]))
             for s in (state, whole)
         ]
         yield Sheets(
