@@ -23,7 +23,7 @@ from submin.adjustment.estimation import cholesky
 from submin.network.sub_min import GroundPart, SubMin
 from submin.query.padded_tiles import padded_tiles
 from submin.query.source import Index, NetworkSource
-from submin.query.tile_pair import TilePair
+from submin.query.tile_pair import TilePair, axes_of_both, weights_of_two
 
 Array = NDArray[np.float64]
 
@@ -52,6 +52,9 @@ def intersection_weights(information: Array, functionals: Array) -> Array:
     information : (t, q, q) information matrices J_t of the estimates; functionals : (q, q) ``F'F``, F being what the trace is taken of
     """
     count = len(information)
+    if count == 2:
+        share, axes = axes_of_both(*information)
+        return weights_of_two(share, np.einsum("ij,ij->j", axes, functionals @ axes))
 
     def shares(weights: Array) -> tuple[float, Array]:
         """The trace, and ``tr(P F'F P J_t)`` of each tile: minus the trace's derivative."""

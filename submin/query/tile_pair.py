@@ -27,6 +27,9 @@ from submin.query.source import Index
 
 Array = NDArray[np.float64]
 
+ROUND_OFF = 1e-15
+"""No share is nearer to 0 or 1."""
+
 
 @dataclass(frozen=True, eq=False)
 class TilePair:
@@ -48,11 +51,7 @@ class TilePair:
     @classmethod
     def of(cls, padded: PaddedTiles) -> TilePair:
         """The axes of two padded tiles."""
-        first, second = padded.common(0), padded.common(1)
-        lower = cholesky(first + second)
-        half = la.solve_triangular(lower, second, lower=True)
-        share, axes = la.eigh(la.solve_triangular(lower, half.T, lower=True), overwrite_a=True, driver="evd")
-        axes = la.solve_triangular(lower, axes, lower=True, trans=1, overwrite_b=True)
+        share, axes = axes_of_both(padded.common(0), padded.common(1))
         # neither tile knows less than the priors, whatever round-off says: Lambda >= I
         least = np.einsum("ij,ij->j", axes, axes)
         vector = padded.holds.T.astype(np.float64) @ padded.vector
@@ -76,15 +75,8 @@ class TilePair:
         return np.asarray(weights[0] * (1.0 - self.share) + weights[1] * self.share)
 
     def weights(self, squares: Array) -> Array:
-        """Weights (2,) on the simplex by which the trace ``sum squares / d``, a convex function of them, is least."""
-
-        def slope(second: float) -> float:
-            return float(squares @ ((1.0 - 2.0 * self.share) / self.information(np.array([1.0 - second, second])) ** 2))
-
-        if slope(0.0) >= 0.0:
-            return np.array([1.0, 0.0])
-        second = 1.0 if slope(1.0) <= 0.0 else float(brentq(slope, 0.0, 1.0, xtol=1e-12))
-        return np.array([1.0 - second, second])
+        """Weights (2,) on the simplex by which the trace ``sum squares / d`` is least."""
+        return weights_of_two(self.share, squares)
 
     def state(self, weights: Array, images: Index) -> SubMin:
         """Those images that are among ``images`` (ascending), from both tiles with weights (2,). A merge has no chi-square."""
@@ -94,3 +86,29 @@ class TilePair:
         theta = reach @ ((weights @ self.vector) / information)
         half = reach / np.sqrt(information)
         return SubMin(self.rows[chosen], theta.reshape(len(chosen), p), half @ half.T, float("nan"), 0, behind=self.rows)
+
+
+def axes_of_both(first: Array, second: Array) -> tuple[Array, Array]:
+    """Shares mu (q,) and axes B (q, q), by columns, of two information matrices: ``B' second B = diag(mu)``, ``B' first B = diag(1 - mu)``.
+
+    Raises
+    ------
+    NumericalError
+        When their sum is not positive definite.
+    """
+    lower = cholesky(first + second)
+    half = la.solve_triangular(lower, second, lower=True)
+    share, axes = la.eigh(la.solve_triangular(lower, half.T, lower=True), overwrite_a=True, driver="evd")
+    return np.clip(share, ROUND_OFF, 1.0 - ROUND_OFF), la.solve_triangular(lower, axes, lower=True, trans=1, overwrite_b=True)
+
+
+def weights_of_two(share: Array, squares: Array) -> Array:
+    """Weights (2,) on the simplex by which ``sum squares / ((1 - w)(1 - share) + w share)``, a convex function of them, is least."""
+
+    def slope(second: float) -> float:
+        return float(squares @ ((1.0 - 2.0 * share) / ((1.0 - second) * (1.0 - share) + second * share) ** 2))
+
+    if slope(0.0) >= 0.0:
+        return np.array([1.0, 0.0])
+    second = 1.0 if slope(1.0) <= 0.0 else float(brentq(slope, 0.0, 1.0, xtol=1e-12))
+    return np.array([1.0 - second, second])
