@@ -58,7 +58,7 @@ def test_the_rays_of_a_point_meet_where_they_are_said_to() -> None:
     """Forward and backward at 22 degrees from 600 km: 24.2 degrees from the vertical on the ground, so heights show with its sine."""
     layout = footprint_layout("one", [footprint("a", 10.0, (FORWARD, BACKWARD))], APriori(), places(10.2, 10.3))
     ground = layout.image_set.ground(geodetic_to_geocentric(layout.truth))
-    higher = layout.image_set.ground(geodetic_to_geocentric(layout.truth + [0.0, 0.0, 100.0]))
+    higher = layout.image_set.ground(geodetic_to_geocentric(layout.truth + np.array([0.0, 0.0, 100.0])))
     theta = np.zeros((2, layout.image_set.parameters))
     low, high = (layout.image_set.project(theta, g, layout.image, layout.point).image for g in (ground, higher))
     moved = (high - low)[:, 1] * 2.5 / 100.0  # along the track, in the plane across the line of sight
