@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ import submin
 from benchmarks.comparison import verdict
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import executor_for
+from orchestration.reconcile import reconcile
 from orchestration.run import run
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.accuracy_map import PointAccuracy
@@ -62,7 +63,10 @@ class Case:
 
 
 def measure(scale: float, workers: int, network: Path | None = None) -> list[dict[str, Any]]:
-    """Rows of the network and of the questions; ``network``: one that is there already, in place of a new one."""
+    """Rows of the network and of the questions; ``network``: one that is there already, in place of a new one.
+
+    It is asked as it is, and once more after it has been reconciled, which is done here where it was not.
+    """
     with tempfile.TemporaryDirectory() as folder:
         place, seconds = (str(network), float("nan")) if network is not None else _made(Path(folder), scale, workers)
         opened = submin.open(place)
@@ -75,7 +79,17 @@ def measure(scale: float, workers: int, network: Path | None = None) -> list[dic
             "made in, s": seconds,
         }]  # fmt: skip
         rows += [_asked(place, case) for case in _cases(opened, rng)]
-        return rows + _of_many(place, opened)
+        rows += _of_many(place, opened)
+        with executor_for(workers) as executor:
+            done = reconcile(place, executor)
+        if not done.tiles:
+            return rows
+        again = [case for case in _cases(submin.open(place), np.random.default_rng(0)) if case.policy in ("tile", "rigorous")]
+        rows += [_asked(place, replace(case, what=f"{case.what}, reconciled")) for case in again]
+        return [*rows, _accuracy_of_many(place, submin.open(place)), {
+            "reconciled": done.version, "tiles": done.tiles, "largest front": done.largest_front, "s": done.seconds,
+            "peak, MB": done.peak_memory_mb,
+        }]  # fmt: skip
 
 
 def _made(folder: Path, scale: float, workers: int) -> tuple[str, float]:
@@ -167,23 +181,29 @@ def _anew(place: str, ids: Ids, policy: str) -> submin.ControlSet:
     return _answer(submin.open(place), ids, policy)
 
 
-def _of_many(place: str, network: submin.Network) -> list[dict[str, Any]]:
-    """A few points out of many, and accuracy point by point."""
+def _box(network: submin.Network, points: int) -> tuple[float, float, float, float]:
+    """About so many points around the middle."""
     cover = network.cover
     low = np.asarray(cover.origin)
     middle = low + 0.5 * cover.core * np.array([cover.columns, cover.rows])
+    half = 0.5 * 1e3 * SPACING_KM * points**0.5
+    lon, lat = cover.geographic(middle[0] + np.array([-half, half]), middle[1] + np.array([-half, half]))
+    return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
 
-    def box(points: int) -> tuple[float, float, float, float]:
-        """About so many points around the middle."""
-        half = 0.5 * 1e3 * SPACING_KM * points**0.5
-        lon, lat = cover.geographic(middle[0] + np.array([-half, half]), middle[1] + np.array([-half, half]))
-        return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
 
-    mapped, thinned = box(MAPPED), box(THINNED)
+def _accuracy_of_many(place: str, network: submin.Network) -> dict[str, Any]:
+    """Accuracy point by point."""
+    ask = partial(submin.Network.accuracy, bbox=_box(network, MAPPED))
+    return _repeated(place, "CE90 and LE90 point by point", "tile", 500.0, ask)
+
+
+def _of_many(place: str, network: submin.Network) -> list[dict[str, Any]]:
+    """A few points out of many, and accuracy point by point."""
+    thinned = _box(network, THINNED)
     few = f"--max-points {ASKED} of {len(network.accuracy(bbox=thinned)):,}"
     return [
         _repeated(place, few, "rigorous", None, partial(submin.Network.query, bbox=thinned, max_points=ASKED, policy="rigorous")),
-        _repeated(place, "CE90 and LE90 point by point", "tile", 500.0, partial(submin.Network.accuracy, bbox=mapped)),
+        _accuracy_of_many(place, network),
         _repeated(place, "CE90 and LE90 of all points", "tile", None, submin.Network.accuracy),
     ]
 

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from submin.network.outside_messages import Elimination, State, unpacked_state
 from submin.network.whitened_vectors import PASS, Vectors, WholeImages, vectors_of
+from submin.query.kept import Kept
 from submin.query.outside import TileState, TreeState, other_priors
 from submin.query.source import NetworkSource
-from submin.storage.arrays import array_of, attributes_of, group_of, read_record, read_table, replace_table, write_record
+from submin.storage.arrays import array_of, attributes_of, group_of, member_names, read_record, read_table, replace_table, write_record
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_symmetric, write_symmetric
 from submin.tiling.tile_tree import TileTree
@@ -35,7 +36,7 @@ EVERYWHERE = -1
 """Stands for a tile where something was lost of which no tile can tell."""
 KINDS = ("changed", "lost", "stale")
 ROOT_CHUNK = 512
-CACHED_ELIMINATIONS = 24
+KEPT_BYTES = 512 * 1024**2
 CACHED_TILES = 256
 
 
@@ -116,11 +117,11 @@ def write_tile_state(root: zarr.Group, name: str, tree: str, node: int, vectors:
 def drop_trees(root: zarr.Group, kept: Iterable[str], tiles: Iterable[str]) -> None:
     """Delete the trees that no tile refers to any more, and the states of all tiles but some (names)."""
     keep = set(kept)
-    for name in list(group_of(root, TREES).group_keys()):
+    for name in member_names(group_of(root, TREES)):
         if name.split("n")[0] not in keep:
             del group_of(root, TREES)[name]
     stay = set(tiles)
-    for name in list(group_of(root, TILE_STATES).group_keys()):
+    for name in member_names(group_of(root, TILE_STATES)):
         if name not in stay:
             del group_of(root, TILE_STATES)[name]
 
@@ -195,7 +196,9 @@ class ReconciledStore:
         self._snapshot, self._open = snapshot, earlier
         self._tiles: OrderedDict[int, TileState | None] = OrderedDict()
         self._trees: dict[str, TreeState] = {}
-        self._eliminations: OrderedDict[tuple[str, int], Elimination] = OrderedDict()
+        self._eliminations: Kept[Elimination] = Kept(KEPT_BYTES)
+        self._covariances: Kept[Array] = Kept(KEPT_BYTES)
+        self._asked: set[int] = set()
         self._earlier: tuple[int, NetworkSource] | None = None
 
     @classmethod
@@ -209,7 +212,7 @@ class ReconciledStore:
 
     @cached_property
     def _names(self) -> frozenset[str]:
-        return frozenset(group_of(self._snapshot.root, TILE_STATES).group_keys())
+        return frozenset(member_names(group_of(self._snapshot.root, TILE_STATES)))
 
     def __bool__(self) -> bool:
         return bool(self._names)
@@ -249,17 +252,23 @@ class ReconciledStore:
         return self._trees[name]
 
     def covariance(self, tile: int, columns: NDArray[np.int64]) -> Array:
-        """Covariance (k, k) of some of the tile's vectors (columns, ascending), both triangles."""
-        return read_symmetric(group_of(self._snapshot.root, f"{TILE_STATES}/{self._snapshot.cover.tile_name(tile)}"), "covariance", columns)
+        """Covariance (k, k) of some of the tile's vectors (columns, ascending), both triangles.
+
+        Of a tile that is asked for again the whole is kept in memory.
+        """
+        whole = self._covariances.get(tile)
+        if whole is None:
+            group = group_of(self._snapshot.root, f"{TILE_STATES}/{self._snapshot.cover.tile_name(tile)}")
+            if tile not in self._asked:
+                self._asked.add(tile)
+                return read_symmetric(group, "covariance", columns)
+            whole = self._covariances.put(tile, read_symmetric(group, "covariance"))
+        return whole[np.ix_(columns, columns)]
 
     def elimination(self, tree: str, node: int) -> Elimination:
         """What was eliminated at a node; the latest used ones are kept in memory."""
-        if (tree, node) not in self._eliminations:
-            self._eliminations[tree, node] = read_elimination(self._snapshot.root, tree, node)
-            if len(self._eliminations) > CACHED_ELIMINATIONS:
-                self._eliminations.popitem(last=False)
-        self._eliminations.move_to_end((tree, node))
-        return self._eliminations[tree, node]
+        known = self._eliminations.get((tree, node))
+        return self._eliminations.put((tree, node), read_elimination(self._snapshot.root, tree, node)) if known is None else known
 
     def earlier(self, version: int) -> NetworkSource:
         """The network as it was at a version."""

@@ -12,6 +12,7 @@ import pytest
 import scipy.linalg as la
 from networks import accepted_rays, area_of, fuse, same_network
 from numpy.typing import NDArray
+from whole_network import whole_network
 
 import submin
 from orchestration.check import check
@@ -20,6 +21,7 @@ from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.info import describe
 from orchestration.progress import Silent
+from orchestration.reconcile import reconcile
 from orchestration.run import fuse_blocks, run
 from orchestration.withdraw import withdraw
 from submin.adjustment import joint_errors
@@ -432,3 +434,13 @@ def test_a_covariance_that_is_none_is_refused_before_anything_is_written(base: P
 def _own(points: PointTable, joint: Array) -> Array:
     n, axes = len(points), local_axes(points.geodetic)
     return np.asarray(axes @ joint.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :] @ np.swapaxes(axes, 1, 2))
+
+
+def test_a_reconciled_network_has_the_errors_that_control_points_share(base: Path, control: PointTable) -> None:
+    """The vectors of a set are held by tiles that see some of its points."""
+    add_control(control, "control", str(base), HERE)
+    reconcile(str(base), HERE)
+    whole_network(base)
+    withdraw(str(base), HERE, control=str(control.point_ids[0]))
+    reconcile(str(base), HERE)
+    whole_network(base)

@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from networks import accepted_rays, area_of, fuse, rewrite, same_network
 from numpy.typing import NDArray
+from whole_network import excess, points, truth, whole_network
 
 import submin
+from orchestration.executors import SerialExecutor
+from orchestration.reconcile import reconcile
 from submin.accuracy import nees_per_dof
 from submin.adjustment.priors import ImagePrior, prior_factor
 from submin.geodesy import geodetic_to_geocentric, local_axes
@@ -112,3 +115,19 @@ def test_a_network_grows_wider_when_a_sensor_with_more_parameters_comes(
     assert Snapshot.open(str(network)).metadata.parameters == Snapshot.open(str(at_once)).metadata.parameters == 7
     same_network(network, at_once)
     assert len(submin.open(network, "v1").query(bbox=(90, 30, 110, 40), policy="rigorous"))
+
+
+def test_a_reconciled_network_takes_a_sensor_with_more_parameters(
+    blocks: list[Block], region: SimulatedRegion, catalogue: Path, tmp_path: Path
+) -> None:  # fmt: skip
+    network = tmp_path / "network"
+    fuse(rewrite(catalogue, tmp_path / "plain", [*blocks[:6], *blocks[7:]]), network, area_of(region))
+    reconcile(str(network), SerialExecutor())
+    fuse(rewrite(catalogue, tmp_path / "wider", [blocks[6]]), network, area_of(region))
+    opened = submin.open(network)
+    whole = truth(opened)
+    for tile in opened.snapshot.tile_numbers():
+        answer = opened.query(tile=opened.cover.tile_name(tile))
+        assert excess(answer.covariance, points(opened, [tile], whole)[2]) <= 1.0 + 1e-6
+    reconcile(str(network), SerialExecutor())
+    whole_network(network)

@@ -16,25 +16,26 @@ import scipy.linalg as la
 import shapely
 from networks import area_of, rewrite
 from numpy.typing import NDArray
+from whole_network import excess, points, same, truth, whole_network
 
 import submin
-from orchestration.create import create
+from orchestration.create import create, fit_catalogue
 from orchestration.executors import SerialExecutor, executor_for
 from orchestration.reconcile import reconcile, reconcile_changes
 from orchestration.run import run
 from orchestration.withdraw import withdraw
-from submin.adjustment.elimination import Sums
-from submin.network.sub_min import SubMin, add_sums, factor, joint_covariance, loadings, locate
 from submin.query import outside
 from submin.query.outside import TreeState
-from submin.query.planner import all_points, determined_parts, points_of_tile
+from submin.query.planner import points_of_tile
 from submin.query.source import NetworkSource
+from submin.simulation.five_blocks import five_blocks
 from submin.simulation.region import RegionDesign, SimulatedRegion, simulate_region
+from submin.simulation.scene import realise
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.network import Network
 from submin.storage.network_store import Snapshot, versions
-from submin.storage.simulated import write_region
+from submin.storage.simulated import write_region, write_scene
 from submin.tiling import tile_tree
 
 Array = NDArray[np.float64]
@@ -73,63 +74,6 @@ def fuse(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> Callable[.
         return place
 
     return run_blocks
-
-
-def truth(now: Network, then: Network | None = None, held: Sequence[int] = ()) -> SubMin:
-    """All images from the cells as they are now; with ``then`` as they were, but for those that the tiles ``held`` hold."""
-    cells: dict[str, tuple[NDArray[np.int32], Sums]] = {}
-    for network, wanted in ((now, True), (then, False)):
-        if network is not None:
-            for cell in network.cell_numbers():
-                if then is None or bool({*network.cover.holders(cell)} & {*held}) == wanted:
-                    cells[network.cover.cell_name(cell)] = network.cell_sums(cell)
-    rows = np.unique(np.concatenate([images for images, _ in cells.values()])).astype(np.int32)
-    images = now.image_set(rows)
-    return factor(add_sums(list(cells.values()), rows, images.parameters), rows, images)
-
-
-def points(network: Network, tiles: Sequence[int], state: SubMin) -> tuple[NDArray[np.str_], Array, Array]:
-    """Ids, coordinates and joint covariance of all points that some tiles hold, by a state of all images."""
-    cells = {s.cell.number: s for tile in tiles for s in points_of_tile(network, tile)}
-    kept, parts = determined_parts(network, list(cells.values()))
-    ids = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
-    own = np.concatenate([part.factors.own for part in parts])
-    covariance = joint_covariance(loadings(parts, state.images, state.theta.shape[1]), own, state.covariance)
-    order = np.argsort(ids)
-    axes = (3 * order[:, None] + np.arange(3)).ravel()
-    return ids[order], np.concatenate([locate(part, state) for part in parts])[order], covariance[np.ix_(axes, axes)]
-
-
-def same(network: Network, tile: int, state: SubMin, tolerance: float = 1e-8) -> None:
-    """A tile alone answers as a state of all images does."""
-    answer = network.query(tile=network.cover.tile_name(tile))
-    ids, at, covariance = points(network, [tile], state)
-    assert answer.ids.tolist() == ids.tolist()
-    assert len(ids) > 0
-    np.testing.assert_allclose(answer.covariance, covariance, atol=tolerance * np.abs(covariance).max(), rtol=0.0)
-    sigma = np.sqrt(np.diag(covariance))
-    assert (np.abs(answer.geocentric - at).ravel() / sigma).max() < 1e-6
-
-
-def excess(reported: Array, true: Array) -> float:
-    """Largest eigenvalue of ``P_rep^-1 P_true``: above 1 more is claimed than is known."""
-    return float(la.eigh(true, reported, eigvals_only=True)[-1])
-
-
-def whole_network(place: Path) -> None:
-    """Each tile alone, and all tiles together, answer as one factorisation of all cells."""
-    network = submin.open(place)
-    state = truth(network)
-    for tile in network.snapshot.tile_numbers():
-        if points_of_tile(network, tile):
-            same(network, tile, state)
-            assert network.query(tile=network.cover.tile_name(tile)).scope == "network"
-    every = np.concatenate([s.cell.point_ids[s.rows] for s in all_points(network)])
-    answer = network.query(points=every, policy="rigorous")
-    _, at, covariance = points(network, network.snapshot.tile_numbers(), state)
-    np.testing.assert_allclose(answer.covariance, covariance, atol=1e-9 * np.abs(covariance).max(), rtol=0.0)
-    assert np.abs(answer.geocentric - at).max() < 1e-6
-    assert answer.scope == "network"
 
 
 @pytest.mark.parametrize(("tile_km", "overlap_km"), [(40.0, 0.0), (40.0, 15.0), (40.0, 39.0), (25.0, 10.0), (100.0, 50.0)])
@@ -390,6 +334,18 @@ def test_two_workers_give_the_same_states(fuse: Callable[..., Path], few: list[B
         assert a.ids.tolist() == b.ids.tolist()
         if len(a.ids):
             np.testing.assert_allclose(a.covariance, b.covariance, atol=1e-9 * np.abs(a.covariance).max(), rtol=0.0)
+
+
+def test_images_whose_errors_are_correlated_in_their_block(tmp_path: Path) -> None:
+    """The 2008 paper's five blocks: a block's vectors are held whole, also by tiles that see one of its images."""
+    write_scene(realise(five_blocks(), 3), tmp_path / "catalogue")
+    opened = Catalogue.open(tmp_path / "catalogue")
+    area, _, _ = fit_catalogue(opened)
+    create(str(tmp_path / "network"), area, opened.metadata, 12.0, 3.0)
+    assert run(opened, str(tmp_path / "network"), HERE).fused == 5
+    assert len(submin.open(tmp_path / "network").snapshot.tile_numbers()) >= 4
+    reconcile(str(tmp_path / "network"), HERE)
+    whole_network(tmp_path / "network")
 
 
 def test_versions_before_stay_as_they_were(fuse: Callable[..., Path], few: list[Block]) -> None:
