@@ -281,7 +281,11 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
     compile_kernels()
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     # set before the workers load numpy
-    settings = {"distributed.nanny.pre-spawn-environ": threads, "distributed.worker.memory.terminate": False}
+    settings = {
+        "distributed.nanny.pre-spawn-environ": threads, "distributed.worker.memory.terminate": False,
+        # a killed worker may take long to come again where machines are busy; given up after this, it never would, and be waited for
+        "distributed.deploy.lost-worker-timeout": "1 day",
+    }  # fmt: skip
     with dask.config.set(settings | SHARED_VALUES_GO_WITH_TASKS):
         with _children_deaf_to_ctrl_c():
             cluster = LocalCluster(
