@@ -128,6 +128,17 @@ class World:
         add_control(read_point_table(path), "survey", str(self.fused), SerialExecutor())
         return path
 
+    def joining(self, change: Callable[[dict[str, Any]], Any]) -> list[Any]:
+        """A query that joins an earlier answer, arrays of which are changed."""
+        west, south, east, north = BOX[1:]
+        path = self.folder / "other.npz"
+        submin.open(self.fused).query(bbox=(west, south, east, north)).to_npz(path)
+        with np.load(path) as file:
+            arrays = dict(file)
+        change(arrays)
+        np.savez(path, **arrays)
+        return ["query", self.fused, *BOX, "--join", path]
+
     def dense(self) -> Path:
         """An empty network of the dense form."""
         place = self.folder / "dense"
@@ -267,6 +278,11 @@ def case(name: str) -> Callable[[Callable[[World], list[Any]]], Callable[[World]
         return function
 
     return enter
+
+
+def put(values: np.ndarray, at: int, value: Any) -> None:
+    """An assignment, in a lambda."""
+    values[at] = value
 
 
 def simply(name: str, words: Callable[[World], list[Any]]) -> None:
@@ -885,6 +901,13 @@ simply(
 simply("added control with a negative sigma", lambda w: surveyed(w, f"{HEADER},sigma_e,sigma_n,sigma_u", "P,100,35,0,-1,1,1"))
 simply("added control with a sigma of zero", lambda w: surveyed(w, f"{HEADER},sigma_e,sigma_n,sigma_u", "P,100,35,0,1,0,1"))
 simply("tag that is taken", lambda w: ["tag", w.tagged(), "mine"])
+simply("details of points that join from elsewhere", lambda w: [*w.joining(lambda a: None), "--details", "--out", w.folder / "points.csv"])
+simply("control to join in another format", lambda w: ["query", w.fused, *BOX, "--join", w.write("other.csv", "point_id\n")])
+simply("control to join that does not say where it is", lambda w: w.joining(lambda a: a.pop("frame")))
+simply("control to join with a point twice", lambda w: w.joining(lambda a: put(a["ids"], 1, a["ids"][0])))
+simply("control to join in another frame, epoch or ellipsoid", lambda w: w.joining(lambda a: a.update(frame=np.array("PZ-90"))))
+simply("control to join without a common point", lambda w: w.joining(lambda a: a.update(ids=np.char.add("X", a["ids"]))))
+simply("control to join with an id elsewhere", lambda w: w.joining(lambda a: a.update(geocentric=a["geocentric"] + 1e5)))
 simply("tag like a version", lambda w: ["tag", w.fused, "v1"])
 simply("difference to an unknown version", lambda w: ["diff", w.fused, "v0", "v8"])
 
