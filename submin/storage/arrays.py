@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +17,7 @@ from submin.errors import StoreError
 from submin.network.id_hash import hash_ids as hash_ids  # by which the directory finds points
 
 AnyArray = NDArray[Any]
+T = TypeVar("T")
 
 REALS_CHUNK = 1 << 17
 TABLE_CHUNK = 1 << 16
@@ -117,7 +118,7 @@ def read_records(parent: zarr.Group, names: Iterable[str], wanted: Iterable[str]
         return Record(dict(group.attrs), await _parts(group, chosen))
 
     async def every() -> list[Record | None]:
-        return list(await asyncio.gather(*(one(name) for name in names)))
+        return await _side_by_side(one(name) for name in names)
 
     return sync(every())
 
@@ -129,7 +130,7 @@ def existing_groups(parent: zarr.Group, names: Iterable[str]) -> list[bool]:
         return bool(await parent._async_group.contains(name))
 
     async def every() -> list[bool]:
-        return list(await asyncio.gather(*(one(name) for name in names)))
+        return await _side_by_side(one(name) for name in names)
 
     return sync(every())
 
@@ -141,6 +142,17 @@ def member_names(group: zarr.Group) -> list[str]:
         return [name async for name in group.store.list_dir(group.path)]
 
     return sorted(name for name in sync(every()) if name != "zarr.json")
+
+
+async def _side_by_side(reads: Iterable[Awaitable[T]]) -> list[T]:
+    """What some reads give. An error is raised once all are done: the event loop would print those that nobody waits for."""
+    done = await asyncio.gather(*reads, return_exceptions=True)
+    found: list[T] = []
+    for value in done:
+        if isinstance(value, BaseException):
+            raise value
+        found.append(value)
+    return found
 
 
 async def _array(group: zarr.AsyncGroup, name: str) -> zarr.AsyncArray[Any]:
@@ -168,7 +180,7 @@ async def _parts(group: zarr.AsyncGroup, names: frozenset[str] | None) -> dict[s
         low, high = spans.get(kind, (start, stop))
         spans[kind] = (min(low, start), max(high, stop))
     filled = [kind for kind, (low, high) in spans.items() if high > low]  # an array without entries is not stored
-    read = await asyncio.gather(*(_span(group, kind, *spans[kind]) for kind in filled))
+    read = await _side_by_side(_span(group, kind, *spans[kind]) for kind in filled)
     data = dict.fromkeys(spans, np.empty(0)) | dict(zip(filled, read, strict=True))
     parts: dict[str, AnyArray] = {}
     for part, kind, start, shape in chosen:
@@ -237,7 +249,7 @@ def read_spans(group: zarr.Group, wanted: Iterable[str] | None, spans: Sequence[
         return decode_text(data, ends - base)
 
     async def every() -> list[AnyArray]:
-        return list(await asyncio.gather(*(one(column, start, stop) for start, stop in spans for column in columns)))
+        return await _side_by_side(one(column, start, stop) for start, stop in spans for column in columns)
 
     read = iter(sync(every()))
     return [{column: next(read) for column in columns} for _ in spans]

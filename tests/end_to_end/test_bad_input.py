@@ -613,7 +613,7 @@ changed("RPC with swapped axes", lambda w: w.camera(lambda c: c.update(LAT_OFF=c
 changed("priors that are not JSON", lambda w: (w.catalogue / "priors.json").write_text("bias 10"))
 changed("priors that are not an object", lambda w: w.priors([]))
 changed("unknown key in the priors", lambda w: w.priors({"defaults": {}}))
-changed("unknown key in a block's prior", lambda w: w.priors({"default": {"bias_m": 10}}))
+changed("unknown key in a block's prior", lambda w: w.priors({"default": {"bias_mm": 10}}))
 changed("prior of an unknown block", lambda w: w.priors({"blocks": {"T9": {}}}))
 changed("prior without a number", lambda w: w.priors({"default": {"bias_px": "large"}}))
 changed("prior sigma that is not positive", lambda w: w.priors({"default": {"bias_px": 0}}))
