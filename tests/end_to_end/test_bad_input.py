@@ -8,7 +8,6 @@ import re
 import resource
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -26,6 +25,7 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 import zarr
+from command_calls import Call
 from gnss_files import MEASUREMENTS, dna_lines, simulated
 from isis_files import binary, isd, points
 from isis_files import write as write_isis
@@ -34,7 +34,6 @@ from sinex_files import sinex_lines, station_parameters
 
 import submin
 from orchestration.adjust import adjust, write
-from orchestration.cli import main
 from orchestration.control import add_control
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
@@ -1211,25 +1210,6 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def world(tmp_path: Path, origin: Path) -> World:
     return World(tmp_path, origin)
-
-
-Call = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    """Runs a command in this process: its exit code, standard output and standard error."""
-
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["submin", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        printed = capsys.readouterr()
-        code = ended.value.code or 0
-        assert isinstance(code, int)
-        return code, printed.out, printed.err
-
-    return call
 
 
 def state(folder: Path) -> dict[str, tuple[bool, int, int]]:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 import re
 import socket
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import boto3
 import numpy as np
 import pytest
+from command_calls import Call
 
 from benchmarks.faults import EVERYWHERE, Command, Content, Scene, cluster, free_port, make_scene, submin_command, wait_until
-from orchestration.cli import main
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import SerialExecutor
 from orchestration.progress import Silent
@@ -29,7 +28,6 @@ from submin.storage.network_store import Snapshot, versions
 BUCKET = "networks"
 KEYS = {"AWS_ACCESS_KEY_ID": "someone", "AWS_SECRET_ACCESS_KEY": "secret"}
 OTHERS = ("AWS_ENDPOINT_URL_S3", "AWS_REGION", "AWS_DEFAULT_REGION", "AWS_SESSION_TOKEN", "AWS_PROFILE")
-Call = Callable[..., tuple[int, str, str]]
 
 
 def listens(port: int) -> bool:
@@ -88,21 +86,6 @@ def created(scene: Scene, place: str) -> str:
     catalogue = Catalogue.open(scene.catalogue)
     create(place, fit_catalogue(catalogue)[0], catalogue.metadata, 60.0, 20.0)
     return place
-
-
-@pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    """Runs a command in this process: its exit code, standard output and standard error."""
-
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["submin", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        printed = capsys.readouterr()
-        assert isinstance(ended.value.code or 0, int)
-        return int(ended.value.code or 0), printed.out, printed.err
-
-    return call
 
 
 def test_every_step_of_a_networks_life(bucket: str, scene: Scene, in_folder: Content, call: Call, tmp_path: Path) -> None:
