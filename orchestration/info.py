@@ -57,7 +57,7 @@ def describe(network: Network) -> dict[str, Any]:
 
 
 def _reconciled(network: Network) -> str:
-    """Version to which all tiles are reconciled, ``v9 in part`` where some changed since, or nothing."""
+    """Version to which tiles were last reconciled, such as ``v9``; with ``, and changed since`` where some were; ``no`` without any."""
     known = ReconciledStore.of(network.snapshot)
     trees = known.trees().values()
     if not trees:
