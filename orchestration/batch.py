@@ -17,6 +17,7 @@ from orchestration.tasks import BlockAdjustment, BlockRays, FlaggedImage, Gate, 
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import KilledTaskError
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic
+from submin.network.id_numbers import numbered
 from submin.network.innovation import REJECTED, BlockTest
 from submin.network.registration import LooseRays, together
 from submin.storage.block_images import network_images
@@ -97,7 +98,7 @@ def fuse_batch(
     refused = list(rejected)
     accepted, tests = _stage_one(blocks, base, executor, reporter, refused)
     against = {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
-    blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, against, base, refused)
+    blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, against, base, refused, executor)
     ledger = Ledger.of(base)
     unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
     if not blocks and not unsaid:
@@ -180,7 +181,7 @@ def _gates(groups: Sequence[Sequence[Block]], base: Snapshot) -> list[Gate | Non
     if not base.image_count() or not groups:
         return [None] * len(groups)
     shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
-    of_blocks = [np.unique(block.point_ids) for block in chain(*groups)]
+    of_blocks = [numbered(block.point_ids)[0] for block in chain(*groups)]
     cells = iter(np.split(base.candidate_cells(np.concatenate(of_blocks)), np.cumsum([len(ids) for ids in of_blocks])[:-1]))
     of_groups = [tuple(next(cells) for _ in group) for group in groups]
     return [Gate(shared, of_group) if any((cell >= 0).any() for cell in of_group) else None for of_group in of_groups]
@@ -202,7 +203,12 @@ def disagreement(accepted: NDArray[np.bool_]) -> str | None:
 
 
 def _register(
-    blocks: list[Block], accepted: dict[str, NDArray[np.bool_]], against: Mapping[str, str], base: Snapshot, refused: list[Rejected]
+    blocks: list[Block],
+    accepted: dict[str, NDArray[np.bool_]],
+    against: Mapping[str, str],
+    base: Snapshot,
+    refused: list[Rejected],
+    executor: Executor,
 ) -> tuple[list[Block], Move]:
     """Register the rays of the batch; a block that measures a known point elsewhere, or nothing inside the area, is rejected.
 
@@ -211,7 +217,8 @@ def _register(
     while True:
         rays = _arriving(blocks, accepted, base.image_count())
         move = place(
-            base, take_points(base, np.unique(rays.point_ids)), rays, [image for block in blocks for image in network_images(block)]
+            base, take_points(base, numbered(rays.point_ids)[0]), rays,
+            [image for block in blocks for image in network_images(block)], executor,
         )  # fmt: skip
         bad = _misplaced(blocks, rays, move) or {k: against[b.block_id] for k, b in enumerate(blocks) if b.block_id in against}
         if not bad:

@@ -16,10 +16,20 @@ from numpy.typing import NDArray
 
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
-from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, report_of, update_tile
+from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, register_part, update_tile
+from submin.adjustment.images import ImageSet
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.registration import LooseRays, Registration, contradictions, register, taken_out, together
+from submin.network.registration import (
+    LooseRays,
+    Registration,
+    by_points,
+    contradictions,
+    joined,
+    register,
+    taken_out,
+    together,
+)
 from submin.sensors import width_of
 from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
 from submin.storage.catalogue_schema import ImageRecord
@@ -31,6 +41,9 @@ from submin.tiling.cover import Cover
 
 Ids = NDArray[np.str_]
 Index = NDArray[np.int32]
+
+RAYS_A_TASK = 100_000
+"""Rays whose points one task registers."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +144,7 @@ def take_points_seen(base: Snapshot, images: Index) -> TakenOut:
     return TakenOut(loose.take(stays), departures, int((~stays).sum()))
 
 
-def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequence[NetworkImage]) -> Move:
+def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequence[NetworkImage], executor: Executor) -> Move:
     """Register the points taken out with their remaining and arriving rays; split the tiles that would then hold too many images."""
     cover, stored = base.cover, Stored.of(base)
     parameters = max(base.metadata.parameters, width_of(image.sensor for image in new_images))
@@ -141,7 +154,7 @@ def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequen
         old = np.unique(rays.image[rays.image < first]).astype(np.int32)
         rows = np.concatenate([old, np.arange(first, first + len(new_images), dtype=np.int32)])
         images = image_set([*base.images(old), *new_images], base.metadata.ellipsoid, parameters)
-        registration = register(rays, images, rows, cover)
+        registration = _registered(rays, images, rows, cover, executor)
         full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(stored, cover, parameters, tile, out, registration)]
         if not full:
             return Move(cover, parameters, out, registration, contradictions(rays, registration, images, rows, cover), tuple(new_images))
@@ -149,6 +162,16 @@ def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequen
             if tile not in cover.splits:  # not yet, as the larger neighbour of another one
                 cover = cover.split(tile)
         out = _dissolve(base, cover, out)
+
+
+def _registered(rays: LooseRays, images: ImageSet, rows: Index, cover: Cover, executor: Executor) -> Registration:
+    """The points of some rays, a part of them a task: where a point goes depends on its own rays alone."""
+    parts = by_points(rays, max(1, len(rays) // RAYS_A_TASK))
+    if len(parts) == 1:
+        return register(rays, images, rows, cover)
+    known = executor.share((images, rows, replace(cover)))  # without what the cover has worked out: it travels
+    handles = executor.submit_all(register_part, [(rays.take(part), known) for part in parts], "register", lambda: None)
+    return joined(executor.results(handles), parts)
 
 
 def _touched_tiles(cover: Cover, out: TakenOut, registration: Registration) -> list[int]:
@@ -221,10 +244,9 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
             {c: arrivals[c] for c in held if c in arrivals}, {c: departures[c] for c in held if c in departures},
             {c: origins[c] for c in move.cover.cells_owned(tile) if c in origins}, shared,
         ))  # fmt: skip
-    updates = executor.submit_all(update_tile, arguments, "update-tile", reporter.stage("summing tiles", len(tiles)))
-    by_tile = dict(zip(tiles, updates, strict=True))
-    quiet = reporter.stage("summing tiles", 0)
-    reports: list[TileReport] = executor.results(executor.submit_all(report_of, [(u,) for u in updates], "report-of", quiet))
+    handles = executor.submit_all(update_tile, arguments, "update-tile", reporter.stage("summing tiles", len(tiles)))
+    reports: list[TileReport] = executor.results(handles)
+    by_tile = {report.tile: report for report in reports}
 
     before = base.flags()
     split = {*move.cover.splits}
@@ -234,15 +256,18 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     reconsidered = {*released} ^ {row for _, row in before}
     changed = {cell for report in reports for cell in report.changed}
     again = {tile for cell in changed for tile in move.cover.holders(cell)} | _tiles_that_see(base, reconsidered) | move.out.bereft
+    emptied = frozenset(c for report in reports for c, cell in report.cells.items() if not len(cell.images))
     to_factor = []
     for tile in sorted(again - split):
         sources = sorted({Cover.owner(c) for c in move.cover.cells_held(tile)} & set(by_tile))
-        to_factor.append((session.fork(), tile, cover, [by_tile[t] for t in sources], shared, released))
+        to_factor.append((
+            session.fork(), session.fork(), tile, cover, [by_tile[t].writes for t in sources], emptied, shared, released
+        ))  # fmt: skip
     handles = executor.submit_all(factor_tile, to_factor, "factor-tile", reporter.stage("factoring tiles", len(to_factor)))
     factored = executor.results(handles)
     if reports or factored:
         session.merge(*(report.writes for report in reports), *(done.writes for done in factored))
-    gone = [f"cells/{move.cover.cell_name(c)}" for report in reports for c, cell in report.cells.items() if not len(cell.images)]
+    gone = [f"cells/{move.cover.cell_name(c)}" for c in sorted(emptied)]
     gone += [f"cells/{name}" for name in sorted(move.out.dissolved)]
     no_more = {done.tile for done in factored if not done.images} | (split - {*base.cover.splits})
     gone += [f"{group}/{base.cover.tile_name(tile)}" for tile in sorted(no_more) for group in ("tiles", TILE_STATES)]

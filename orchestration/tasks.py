@@ -5,7 +5,7 @@ They live in an importable module, so that Dask sends their names and not their 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import icechunk
@@ -14,7 +14,6 @@ import zarr
 from numpy.typing import NDArray
 
 from submin.adjustment.adjustment import Adjustment, adjust
-from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import blind_image, intersect
 from submin.adjustment.rays import Rays
@@ -22,9 +21,11 @@ from submin.adjustment.status import Cause, Status
 from submin.adjustment.surveyed_points import ContradictedPoint, contradicted_points
 from submin.errors import NumericalError, SubminError
 from submin.geodesy import Ellipsoid
-from submin.network.cell import Cell, RegisteredPoints, bundle, empty_sums, loses, summed, union_of_images, with_points, without_points
+from submin.network.cell import Cell, RegisteredPoints, bundle, loses, summed, union_of_images, with_points, without_points
+from submin.network.id_numbers import numbered
 from submin.network.innovation import BlockTest
 from submin.network.network_image import NetworkImage, image_set
+from submin.network.registration import LooseRays, Registration, register
 from submin.network.sub_min import SubMin, add_sums, factor
 from submin.query.block_innovation import block_test, common_points
 from submin.sensors import sensor_named, width_of
@@ -85,17 +86,8 @@ class CellReport:
 
 
 @dataclass(frozen=True)
-class TileUpdate:
-    """What a tile's update leaves: the sums of the own cells that changed, reports of all own cells, and the writes."""
-
-    tile: int
-    sums: dict[int, tuple[NDArray[np.int32], Sums]]
-    report: TileReport
-
-
-@dataclass(frozen=True)
 class TileReport:
-    """The part of a tile's update that the coordinator keeps.
+    """What a tile's update has found; its cells are in ``writes``, so that no sums wait in memory for their factorisation.
 
     Attributes
     ----------
@@ -150,7 +142,7 @@ def adjust_block(
     accepted = np.ones(len(block.image), dtype=np.bool_)
     try:
         images = image_set(block.images, ellipsoid, width_of(image.sensor for image in block.images))
-        ids, point = np.unique(block.point_ids, return_inverse=True)
+        ids, point = numbered(block.point_ids)
         order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
         rays = Rays(point[order].astype(np.int32), block.image[order], block.observed[order], block.sigma[order], accepted)
         start = intersect(images, rays, len(ids))
@@ -227,6 +219,11 @@ class BlockGate:
         return rows[np.isin(self._passes[rows], [image.pass_id for image in block])]
 
 
+def register_part(rays: LooseRays, known: tuple[ImageSet, NDArray[np.int32], Cover]) -> Registration:
+    """`register` with images, their rows and a cover that all parts of the rays share."""
+    return register(rays, *known)
+
+
 def update_tile(
     writes: icechunk.ForkSession,
     tile: int,
@@ -235,7 +232,7 @@ def update_tile(
     departures: Mapping[int, NDArray[np.str_]],
     origins: Mapping[int, Sequence[int]],
     new_images: Sequence[NetworkImage],
-) -> TileUpdate:
+) -> TileReport:
     """Judge the rays that a tile holds, and sum its own cells.
 
     All rays that the tile holds are adjusted together (they include the neighbours' rays in shared cells); the tile decides only for the
@@ -246,9 +243,9 @@ def update_tile(
     """
     root = zarr.open_group(writes.store, mode="r+")
     snapshot = Snapshot(root, "network", cover, width_of(image.sensor for image in new_images))
-    held, before = [], {}
-    for number in cover.cells_held(tile):
-        before[number] = cell = snapshot.cell(number)
+    numbers = cover.cells_held(tile)
+    held, before = [], dict(zip(numbers, snapshot.cells(numbers, with_sums=False), strict=True))
+    for number, cell in before.items():
         if number in departures:
             cell = without_points(cell, departures[number])
         if number in arrivals:
@@ -258,8 +255,7 @@ def update_tile(
     seen = union_of_images(held)
     if not len(seen):  # the last ray has gone
         emptied = {cell.number: CellReport.empty() for cell in held if Cover.owner(cell.number) == tile}
-        nothing = {number: (seen, empty_sums(0, snapshot.metadata.parameters)) for number in emptied}
-        return TileUpdate(tile, nothing, TileReport(tile, tuple(emptied), emptied, True, False, (), (), True, writes))
+        return TileReport(tile, tuple(emptied), emptied, True, False, (), (), True, writes)
     members = sorted(zip(_images(snapshot, seen, new_images), seen.tolist(), strict=True), key=lambda member: member[0].image_id)
     rows = np.array([row for _, row in members], dtype=np.int32)
     images = image_set(
@@ -274,7 +270,7 @@ def update_tile(
     in_pixels = np.zeros(len(together.row), dtype=np.bool_)
     in_pixels[together.row] = images.in_pixels[together.rays.image]
 
-    sums: dict[int, tuple[NDArray[np.int32], Sums]] = {}
+    changed: list[int] = []
     reports: dict[int, CellReport] = {}
     lost = lost_elsewhere = False
     ray_at = np.cumsum([0, *(len(cell.rays) for cell in held)])
@@ -293,15 +289,14 @@ def update_tile(
             if len(new):
                 counted = int((in_pixels[own_rays] & accepted[own_rays]).sum())
                 write_cell(root, cover.cell_name(cell.number), new, float(squares[own_rays].sum()), counted)
-            sums[cell.number] = (new.images, new.sums)
+            changed.append(cell.number)
         reports[cell.number] = _report(judged)
         lost |= loses(before[cell.number], judged)
-        lost_elsewhere |= any(loses(snapshot.cell(origin), judged) for origin in origins.get(cell.number, ()))
+        lost_elsewhere |= any(loses(snapshot.cell(origin, with_sums=False), judged) for origin in origins.get(cell.number, ()))
     own = np.concatenate([np.full(len(cell), Cover.owner(cell.number) == tile) for cell in held])
     contradicted = contradicted_points(images, together.rays, result, np.concatenate([cell.point_ids for cell in held]), own)
     flagged = _flagged(result, images, rows)
-    report = TileReport(tile, tuple(sums), reports, lost, lost_elsewhere, flagged, contradicted, result.converged, writes)
-    return TileUpdate(tile, sums, report)
+    return TileReport(tile, tuple(changed), reports, lost, lost_elsewhere, flagged, contradicted, result.converged, writes)
 
 
 def _same_state(one: Cell, other: Cell) -> bool:
@@ -313,48 +308,39 @@ def _same_state(one: Cell, other: Cell) -> bool:
     )
 
 
-def report_of(update: TileUpdate) -> TileReport:
-    """The part of an update that goes back to the coordinator; the sums stay with the workers."""
-    return update.report
-
-
 def factor_tile(
+    reads: icechunk.ForkSession,
     writes: icechunk.ForkSession,
     tile: int,
     cover: Cover,
-    updates: Sequence[TileUpdate],
+    updates: Sequence[icechunk.ForkSession],
+    emptied: Collection[int],
     new_images: Sequence[NetworkImage],
-    released: Sequence[int],
+    released: Collection[int],
 ) -> TileFactored:
-    """One factorisation: the tile's sub-MIN from the sums of all cells that it holds, new ones from the updates, the others from the store.
+    """One factorisation: the tile's sub-MIN from the sums of all cells that it holds.
 
-    ``released`` are the rows of all images in the network whose prior is released.
+    Parameters
+    ----------
+    reads : fork in which ``updates``, those of tiles that own any of these cells, come together; nothing is written to it
+    emptied : cells that have lost all points, which the store does not show yet
+    released : rows of all images in the network whose prior is released
     """
-    root = zarr.open_group(writes.store, mode="r+")
-    snapshot = Snapshot(root, "network", cover, width_of(image.sensor for image in new_images))
-    fresh = {number: sums for update in updates for number, sums in update.sums.items()}
-    parts = []
-    cells = []
-    for number in cover.cells_held(tile):
-        if number in fresh:
-            part = fresh[number]
-        else:
-            cell = snapshot.cell(number)
-            part = (cell.images, cell.sums)
-        if len(part[0]):
-            parts.append(part)
-            cells.append(number)
-    if not parts:
+    reads.merge(*updates)
+    snapshot = Snapshot(zarr.open_group(reads.store, mode="r"), "network", cover, width_of(image.sensor for image in new_images))
+    held = [number for number in cover.cells_held(tile) if number not in emptied]
+    found = {number: part for number, part in zip(held, snapshot.some_sums(held), strict=True) if len(part[0])}
+    if not found:
         return TileFactored(tile, 0, writes)
-    rows = np.unique(np.concatenate([part[0] for part in parts])).astype(np.int32)
+    rows = np.unique(np.concatenate([part[0] for part in found.values()])).astype(np.int32)
     gone = set(released)
     images = [replace(image, released=int(row) in gone) for row, image in zip(rows, _images(snapshot, rows, new_images), strict=True)]
     sub_min = factor(
-        add_sums(parts, rows, snapshot.metadata.parameters),
+        add_sums(list(found.values()), rows, snapshot.metadata.parameters),
         rows,
         image_set(images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters),
     )
-    write_sub_min(root, cover.tile_name(tile), sub_min, cells)
+    write_sub_min(zarr.open_group(writes.store, mode="r+"), cover.tile_name(tile), sub_min, list(found))
     return TileFactored(tile, len(rows), writes)
 
 

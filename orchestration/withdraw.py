@@ -105,7 +105,7 @@ def _withdraw(where: str, version: int, leaving: _Leaving, executor: Executor, r
     if leaving.kind == "control point" and len(rows) > VIEWS:
         what += f" and the {len(rows) // VIEWS - 1} points that its errors are correlated with (block {before.block_id})"
     out = take_points_seen(base, rows.astype(np.int32))
-    move = place(base, out, together([]), [])
+    move = place(base, out, together([]), [], executor)
     settled = settle(session, base, move, executor, reporter)
     left = replace(before, version=version + 1, images=before.images - len(rows), rays=before.rays - out.lost)
     if leaving.whole_block:

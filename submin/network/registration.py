@@ -18,6 +18,7 @@ from submin.adjustment.intersection import intersect
 from submin.adjustment.rays import sorted_rays
 from submin.geodesy import geocentric_to_geodetic, geodetic_to_geocentric
 from submin.network.cell import Cell, RegisteredPoints
+from submin.network.id_numbers import numbered
 from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
@@ -52,8 +53,8 @@ class LooseRays:
     def __len__(self) -> int:
         return len(self.image)
 
-    def take(self, rows: Flags) -> LooseRays:
-        """The rays where ``rows`` (r,) is True."""
+    def take(self, rows: Flags | NDArray[np.int64]) -> LooseRays:
+        """The rays of these rows, or where ``rows`` (r,) is True."""
         return LooseRays(*(getattr(self, name)[rows] for name in _NAMES))
 
 
@@ -97,7 +98,7 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
 
     ``images`` are at least those of the rays, ``image_rows`` their rows in the network, ascending.
     """
-    ids, point = np.unique(rays.point_ids, return_inverse=True)
+    ids, point = numbered(rays.point_ids)
     if not len(rays):
         return Registration({}, (ids, np.empty(0, dtype=np.int64)), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
     named = np.argsort(np.array(images.ids, dtype=np.str_))
@@ -129,6 +130,38 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
                 ids[members], origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
             )
     return Registration(arrivals, (ids, at), passing, outside[point])
+
+
+def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
+    """Rows of some rays in so many parts, each with all rays of its points: parts can be registered apart, see `joined`."""
+    ids, point = numbered(rays.point_ids)
+    order = np.argsort(point, kind="stable")
+    ends = np.searchsorted(point[order], [len(ids) * k // parts for k in range(1, parts)])
+    return np.split(order, ends)
+
+
+def joined(parts: Sequence[Registration], rows: Sequence[NDArray[np.int64]]) -> Registration:
+    """The registration of all points from those of parts of their rays, whose rows are those of `by_points`."""
+    back = np.argsort(np.concatenate(rows))
+    arriving: dict[int, list[RegisteredPoints]] = {}
+    for part in parts:
+        for cell, points in part.arrivals.items():
+            arriving.setdefault(cell, []).append(points)
+    ids, cells = (np.concatenate([part.directory[k] for part in parts]) for k in range(2))
+    return Registration(
+        {cell: _one_after_another(arriving[cell]) for cell in sorted(arriving)},
+        (ids, cells),
+        np.concatenate([part.passing for part in parts])[back],
+        np.concatenate([part.outside for part in parts])[back],
+    )
+
+
+def _one_after_another(parts: Sequence[RegisteredPoints]) -> RegisteredPoints:
+    shifts = np.cumsum([0, *(len(part.point_ids) for part in parts)])
+    point = np.concatenate([part.point + shift for part, shift in zip(parts, shifts, strict=False)]).astype(np.int32)
+    names = ("point_ids", "origin", "image", "observed", "sigma")
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return RegisteredPoints(point=point, **columns)
 
 
 def _passing(images: ImageSet, image: NDArray[np.int32], observed: Array, point: NDArray[np.int64], origin: Array) -> Array:
@@ -193,7 +226,7 @@ def _explained(images: ImageSet, image: NDArray[np.int32], rays: LooseRays) -> A
 
 def _apart(point_ids: Ids, passing: Array) -> tuple[Ids, Array]:
     """Points, and the metres (n,) between the places to which the rays of each point; infinite where a camera reaches no ground."""
-    points, point = np.unique(point_ids, return_inverse=True)
+    points, point = numbered(point_ids)
     if not len(points):
         return points, np.empty(0)
     order = np.argsort(point, kind="stable")

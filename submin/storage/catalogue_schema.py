@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from submin.adjustment.joint_errors import JointErrors
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
 from submin.geodesy import WGS84, Ellipsoid
+from submin.network.id_numbers import numbered
 from submin.sensors import sensor_named
 
 Array = NDArray[np.float64]
@@ -293,12 +295,16 @@ class Block:
         That is image ids, passes, cameras, sizes, times, the a priori model and the rays. Neither the order of images or rays nor the
         layout of a camera's JSON text leaves a trace.
         """
+        return self._content_hash
+
+    @cached_property
+    def _content_hash(self) -> str:
         if self.content:
             return hashlib.blake2b(self.content.encode(), digest_size=32).hexdigest()
         order = sorted(range(len(self.images)), key=lambda i: self.images[i].image_id)
         rank = np.empty(len(order), dtype="<i4")
         rank[order] = np.arange(len(order))
-        points, point = np.unique(self.point_ids, return_inverse=True)
+        points, point = numbered(self.point_ids)
         measured = [np.asarray(getattr(self, name), dtype="<f8") + 0.0 for name in _MEASURED]  # + 0.0: one sign of zero
         rays = np.lexsort((*measured[::-1], rank[self.image], point))
         head = {
@@ -341,7 +347,7 @@ def defects(block: Block) -> str | None:
         if bad.any():
             r = int(np.argmax(bad))
             return f"{ray(r)}: {name} is {values[r]}; expected a positive number of pixels"
-    repeated = first_repeated(np.unique(block.point_ids, return_inverse=True)[1], block.image)
+    repeated = first_repeated(numbered(block.point_ids)[1], block.image)
     if repeated is not None:
         r = repeated[1]
         return f"{ray(r)} is measured twice, the second time at sample {block.sample[r]}, line {block.line[r]}; expected one ray"
