@@ -54,7 +54,7 @@ def _block(region: SimulatedRegion) -> BlockRays:
         NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, a_priori) for i in region.images
     )
     return BlockRays(
-        "triplet", images, region.point_ids[region.point], region.image, np.column_stack([region.sample, region.line]),
+        "triplet", images, region.point_ids, region.point, region.image, np.column_stack([region.sample, region.line]),
         np.column_stack([region.sigma_sample, region.sigma_line]),
     )  # fmt: skip
 

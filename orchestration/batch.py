@@ -17,7 +17,6 @@ from orchestration.tasks import BlockAdjustment, BlockRays, FlaggedImage, Gate, 
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import KilledTaskError
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic
-from submin.network.id_numbers import numbered
 from submin.network.innovation import REJECTED, BlockTest
 from submin.network.registration import LooseRays, together
 from submin.storage.block_images import network_images
@@ -181,7 +180,7 @@ def _gates(groups: Sequence[Sequence[Block]], base: Snapshot) -> list[Gate | Non
     if not base.image_count() or not groups:
         return [None] * len(groups)
     shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
-    of_blocks = [numbered(block.point_ids)[0] for block in chain(*groups)]
+    of_blocks = [block.points[0] for block in chain(*groups)]
     cells = iter(np.split(base.candidate_cells(np.concatenate(of_blocks)), np.cumsum([len(ids) for ids in of_blocks])[:-1]))
     of_groups = [tuple(next(cells) for _ in group) for group in groups]
     return [Gate(shared, of_group) if any((cell >= 0).any() for cell in of_group) else None for of_group in of_groups]
@@ -217,7 +216,7 @@ def _register(
     while True:
         rays = _arriving(blocks, accepted, base.image_count())
         move = place(
-            base, take_points(base, numbered(rays.point_ids)[0]), rays,
+            base, take_points(base, rays.ids), rays,
             [image for block in blocks for image in network_images(block)], executor,
         )  # fmt: skip
         bad = _misplaced(blocks, rays, move) or {k: against[b.block_id] for k, b in enumerate(blocks) if b.block_id in against}
@@ -266,14 +265,14 @@ def _registered_at(ids: NDArray[np.str_], move: Move) -> NDArray[np.float64]:
 
 def block_rays(block: Block) -> BlockRays:
     """A block of a catalogue as stage 1 sees it."""
-    return BlockRays(block.block_id, network_images(block), block.point_ids, block.image, block.observed, block.sigma)
+    return BlockRays(block.block_id, network_images(block), *block.points, block.image, block.observed, block.sigma)
 
 
 def _arriving(blocks: Sequence[Block], accepted: dict[str, NDArray[np.bool_]], first_image: int) -> LooseRays:
     starts = first_image + np.cumsum([0, *(len(b.images) for b in blocks)])
     return together([
         LooseRays(
-            b.point_ids, (b.image + start).astype(np.int32), b.observed, b.sigma, accepted[b.block_id],
+            *b.points, (b.image + start).astype(np.int32), b.observed, b.sigma, accepted[b.block_id],
             np.full(len(b), k, dtype=np.int32),
         )
         for k, (b, start) in enumerate(zip(blocks, starts, strict=False))

@@ -217,7 +217,7 @@ def _dissolve(base: Snapshot, cover: Cover, out: TakenOut) -> TakenOut:
     """Take out all points of the cells that are none of a refined cover; they are named by tiles that are split now."""
     split = {*cover.splits} - {*base.cover.splits}
     rays, departures, dissolved, bereft = [], dict(out.departures), set(out.dissolved), set(out.bereft)
-    taken = np.unique(out.rays.point_ids)
+    taken = out.rays.ids
     for number in base.cell_numbers():
         name = base.cover.cell_name(number)
         if name not in dissolved and split.intersection(base.cover.holders(number)):

@@ -67,7 +67,8 @@ def free_points(block: Block, ellipsoid: Ellipsoid) -> Member:
         raise InputError(reason)
     images = image_set(raw.images, ellipsoid, width_of(image.sensor for image in raw.images))
     used = outcome.accepted
-    ids, point = np.unique(raw.point_ids[used], return_inverse=True)
+    seen, point = np.unique(raw.point[used], return_inverse=True)
+    ids = raw.ids[seen]
     order = np.lexsort((raw.observed[used][:, 1], raw.observed[used][:, 0], raw.image[used], point))
     rays = Rays(
         point[order].astype(np.int32), raw.image[used][order], raw.observed[used][order], raw.sigma[used][order],

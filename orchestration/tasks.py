@@ -22,7 +22,6 @@ from submin.adjustment.surveyed_points import ContradictedPoint, contradicted_po
 from submin.errors import NumericalError, SubminError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, loses, summed, union_of_images, with_points, without_points
-from submin.network.id_numbers import numbered
 from submin.network.innovation import BlockTest
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import LooseRays, Registration, register
@@ -42,11 +41,12 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class BlockRays:
-    """A block as stage 1 sees it: its images, and its rays by point id and image."""
+    """A block as stage 1 sees it: its images, the ids of its points (ascending), and its rays by point and image."""
 
     block_id: str
     images: tuple[NetworkImage, ...]
-    point_ids: NDArray[np.str_]
+    ids: NDArray[np.str_]
+    point: NDArray[np.int32]
     image: NDArray[np.int32]
     observed: Array
     sigma: Array
@@ -142,9 +142,9 @@ def adjust_block(
     accepted = np.ones(len(block.image), dtype=np.bool_)
     try:
         images = image_set(block.images, ellipsoid, width_of(image.sensor for image in block.images))
-        ids, point = numbered(block.point_ids)
+        ids, point = block.ids, block.point
         order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
-        rays = Rays(point[order].astype(np.int32), block.image[order], block.observed[order], block.sigma[order], accepted)
+        rays = Rays(point[order], block.image[order], block.observed[order], block.sigma[order], accepted)
         start = intersect(images, rays, len(ids))
         lost = np.flatnonzero(~np.isfinite(start).all(axis=1))
         blind = (int(rays.image[np.searchsorted(rays.point, lost[0])]), int(lost[0])) if len(lost) else blind_image(images, rays)

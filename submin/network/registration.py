@@ -37,42 +37,64 @@ class LooseRays:
 
     Attributes
     ----------
-    point_ids : (r,) ids of the points; image : (r,) row of the network's images
+    ids : (n,) ids of their points, ascending; point : (r,) row of each ray's point in ``ids``, each of which has a ray
+    image : (r,) row of the network's images
     observed, sigma : (r, 2)
     accepted : (r,) as last judged: by stage 1, or in the cell
     block : (r,) number of each ray's block within its batch; `IN_THE_NETWORK` for a ray taken out of a cell
     """
 
-    point_ids: Ids
+    ids: Ids
+    point: NDArray[np.int32]
     image: NDArray[np.int32]
     observed: Array
     sigma: Array
     accepted: Flags
     block: NDArray[np.int32]
 
+    @classmethod
+    def of(
+        cls, point_ids: Ids, image: NDArray[np.int32], observed: Array, sigma: Array, accepted: Flags, block: NDArray[np.int32]
+    ) -> LooseRays:
+        """Rays with the id (r,) of each one's point."""
+        ids, point = numbered(point_ids)
+        return cls(ids, point.astype(np.int32), image, observed, sigma, accepted, block)
+
     def __len__(self) -> int:
         return len(self.image)
 
+    @property
+    def point_ids(self) -> Ids:
+        """Id (r,) of each ray's point."""
+        return self.ids[self.point]
+
     def take(self, rows: Flags | NDArray[np.int64]) -> LooseRays:
         """The rays of these rows, or where ``rows`` (r,) is True."""
-        return LooseRays(*(getattr(self, name)[rows] for name in _NAMES))
+        points, point = np.unique(self.point[rows], return_inverse=True)
+        return LooseRays(self.ids[points], point.astype(np.int32), *(getattr(self, name)[rows] for name in _OF_RAYS))
 
 
-_NAMES = tuple(field.name for field in fields(LooseRays))
+_OF_RAYS = tuple(field.name for field in fields(LooseRays))[2:]
 
 
 def together(parts: Sequence[LooseRays]) -> LooseRays:
     """All rays of some parts."""
     none = np.empty(0, dtype=np.int32)
-    empty = LooseRays(np.empty(0, dtype="U1"), none, np.empty((0, 2)), np.empty((0, 2)), none.astype(np.bool_), none)
-    return LooseRays(*(np.concatenate([getattr(part, name) for part in (empty, *parts)]) for name in _NAMES))
+    every = (LooseRays(np.empty(0, dtype="U1"), none, none, np.empty((0, 2)), np.empty((0, 2)), none.astype(np.bool_), none), *parts)
+    ids, place = numbered(np.concatenate([part.ids for part in every]))
+    places = np.split(place.astype(np.int32), np.cumsum([len(part.ids) for part in every])[:-1])
+    point = np.concatenate([of_part[part.point] for part, of_part in zip(every, places, strict=True)])
+    return LooseRays(ids, point, *(np.concatenate([getattr(part, name) for part in every]) for name in _OF_RAYS))
 
 
 def taken_out(cell: Cell, points: Flags) -> LooseRays:
     """The rays of those of a cell's points where ``points`` (n,) is True."""
     rays = cell.rays.take(points[cell.rays.point])
+    seen, point = np.unique(rays.point, return_inverse=True)
     block = np.full(len(rays), IN_THE_NETWORK, dtype=np.int32)
-    return LooseRays(cell.point_ids[rays.point], cell.images[rays.image], rays.observed, rays.sigma, rays.accepted, block)
+    return LooseRays(
+        cell.point_ids[seen], point.astype(np.int32), cell.images[rays.image], rays.observed, rays.sigma, rays.accepted, block
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -98,7 +120,7 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
 
     ``images`` are at least those of the rays, ``image_rows`` their rows in the network, ascending.
     """
-    ids, point = numbered(rays.point_ids)
+    ids, point = rays.ids, rays.point
     if not len(rays):
         return Registration({}, (ids, np.empty(0, dtype=np.int64)), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
     named = np.argsort(np.array(images.ids, dtype=np.str_))
@@ -108,7 +130,7 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     local = rank[np.searchsorted(image_rows, rays.image)]
 
     every = np.ones(len(rays), dtype=np.bool_)
-    origin = intersect(images, sorted_rays(point.astype(np.int32), local, rays.observed, rays.sigma, every), len(ids))
+    origin = intersect(images, sorted_rays(point, local, rays.observed, rays.sigma, every), len(ids))
     reached: Flags = np.asarray(np.isfinite(origin).all(axis=1))
     at = np.full(len(ids), -1, dtype=np.int64)
     outside: Flags = np.zeros(len(ids), dtype=np.bool_)
@@ -134,10 +156,8 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
 
 def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
     """Rows of some rays in so many parts, each with all rays of its points: parts can be registered apart, see `joined`."""
-    ids, point = numbered(rays.point_ids)
-    order = np.argsort(point, kind="stable")
-    ends = np.searchsorted(point[order], [len(ids) * k // parts for k in range(1, parts)])
-    return np.split(order, ends)
+    part = (rays.point.astype(np.int64) * parts // max(len(rays.ids), 1)).astype(np.uint16)
+    return np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part, minlength=parts))[:-1])
 
 
 def joined(parts: Sequence[Registration], rows: Sequence[NDArray[np.int64]]) -> Registration:
@@ -183,32 +203,32 @@ def contradictions(
     that were accepted when last judged: a blunder that stage 1 has found is no second place. Arguments as of `register`, and its result.
     """
     counts = rays.accepted | ~np.isfinite(registration.passing).all(axis=1)
-    far, apart = _apart(rays.point_ids[counts], registration.passing[counts])
-    doubtful = rays.take(counts & np.isin(rays.point_ids, far[apart > SAME_POINT_METRES]))
-    names, most = _most_apart(doubtful, images, image_rows)
+    apart = _apart(rays.point[counts], registration.passing[counts], len(rays.ids))
+    doubtful = rays.take(counts & (apart > SAME_POINT_METRES)[rays.point])
+    most = _most_apart(doubtful, images, image_rows)
     kept = doubtful.block == IN_THE_NETWORK
     found: dict[int, tuple[str, float]] = {}
     for block in np.unique(doubtful.block[~kept]).tolist():
         mine = doubtful.block == block
-        together_now = doubtful.take((kept | mine) & np.isin(doubtful.point_ids, doubtful.point_ids[mine]))
-        points, apart = _apart(together_now.point_ids, register(together_now, images, image_rows, cover).passing)
-        too_far = apart - most[np.searchsorted(names, points)]
+        now = (kept | mine) & np.isin(doubtful.point, doubtful.point[mine])
+        together_now, points = doubtful.take(now), np.unique(doubtful.point[now])
+        apart = _apart(together_now.point, register(together_now, images, image_rows, cover).passing, len(points))
+        too_far = apart - most[points]
         worst = int(np.argmax(too_far))
         if too_far[worst] > 0.0:
-            found[block] = (str(points[worst]), float(apart[worst]))
+            found[block] = (str(together_now.ids[worst]), float(apart[worst]))
         else:
             kept |= mine
     return found
 
 
-def _most_apart(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32]) -> tuple[Ids, Array]:
-    """Points of some rays, ascending, and how far apart (n,) their rays may place each, metres, with cameras known as they are a priori."""
-    names, point = np.unique(rays.point_ids, return_inverse=True)
-    most = np.zeros(len(names))
-    if len(names):
+def _most_apart(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32]) -> Array:
+    """How far apart (n,) the rays of each point may place it, metres, with cameras known as they are a priori."""
+    most = np.zeros(len(rays.ids))
+    if len(rays):
         seen, image = np.unique(np.searchsorted(image_rows, rays.image), return_inverse=True)
-        np.maximum.at(most, point, _explained(images.take(seen), image.astype(np.int32), rays))
-    return names, np.maximum(SAME_POINT_METRES, 2.0 * most)  # one ray to the one side, another to the other
+        np.maximum.at(most, rays.point, _explained(images.take(seen), image.astype(np.int32), rays))
+    return np.maximum(SAME_POINT_METRES, 2.0 * most)  # one ray to the one side, another to the other
 
 
 def _explained(images: ImageSet, image: NDArray[np.int32], rays: LooseRays) -> Array:
@@ -224,13 +244,16 @@ def _explained(images: ImageSet, image: NDArray[np.int32], rays: LooseRays) -> A
     return explained
 
 
-def _apart(point_ids: Ids, passing: Array) -> tuple[Ids, Array]:
-    """Points, and the metres (n,) between the places to which the rays of each point; infinite where a camera reaches no ground."""
-    points, point = numbered(point_ids)
-    if not len(points):
-        return points, np.empty(0)
+def _apart(point: NDArray[np.int32], passing: Array, points: int) -> Array:
+    """Metres (n,) between the places to which the rays of each of n points point.
+
+    Infinite where a camera reaches no ground, 0 for a point without rays.
+    """
     order = np.argsort(point, kind="stable")
-    first = np.searchsorted(point[order], np.arange(len(points)))
-    high, low = np.maximum.reduceat(passing[order], first, axis=0), np.minimum.reduceat(passing[order], first, axis=0)
-    with np.errstate(invalid="ignore"):
-        return points, np.linalg.norm(np.where(np.isfinite(high), high - low, np.inf), axis=1)
+    seen, first = np.unique(point[order], return_index=True)
+    apart = np.zeros(points)
+    if len(seen):
+        high, low = np.maximum.reduceat(passing[order], first, axis=0), np.minimum.reduceat(passing[order], first, axis=0)
+        with np.errstate(invalid="ignore"):
+            apart[seen] = np.linalg.norm(np.where(np.isfinite(high), high - low, np.inf), axis=1)
+    return apart

@@ -279,6 +279,12 @@ class Block:
     def __len__(self) -> int:
         return len(self.image)
 
+    @cached_property
+    def points(self) -> tuple[Ids, Index]:
+        """Ids (n,) of the ground points, ascending, and the place (r,) of each ray's point among them."""
+        ids, point = numbered(self.point_ids)
+        return ids, point.astype(np.int32)
+
     @property
     def observed(self) -> Array:
         """Sample and line (r, 2) of each ray, pixels."""
@@ -304,7 +310,7 @@ class Block:
         order = sorted(range(len(self.images)), key=lambda i: self.images[i].image_id)
         rank = np.empty(len(order), dtype="<i4")
         rank[order] = np.arange(len(order))
-        points, point = numbered(self.point_ids)
+        points, point = self.points
         measured = [np.asarray(getattr(self, name), dtype="<f8") + 0.0 for name in _MEASURED]  # + 0.0: one sign of zero
         rays = np.lexsort((*measured[::-1], rank[self.image], point))
         head = {
@@ -347,7 +353,7 @@ def defects(block: Block) -> str | None:
         if bad.any():
             r = int(np.argmax(bad))
             return f"{ray(r)}: {name} is {values[r]}; expected a positive number of pixels"
-    repeated = first_repeated(numbered(block.point_ids)[1], block.image)
+    repeated = first_repeated(block.points[1], block.image)
     if repeated is not None:
         r = repeated[1]
         return f"{ray(r)} is measured twice, the second time at sample {block.sample[r]}, line {block.line[r]}; expected one ray"

@@ -95,7 +95,7 @@ def observed(ground: Array, image: int, seed: int = 1) -> Array:
 def arriving(ids: Sequence[str], ground: Array, images: Sequence[int], block: int = 0) -> LooseRays:
     """Rays of every point in each of some images."""
     n = len(ids)
-    return LooseRays(
+    return LooseRays.of(
         np.tile(np.array(ids, dtype=np.str_), len(images)), (ROW + np.repeat(np.array(images, dtype=np.int32), n)).astype(np.int32),
         np.concatenate([observed(ground, i) for i in images]), np.full((n * len(images), 2), 0.3),
         np.ones(n * len(images), dtype=np.bool_), np.full(n * len(images), block, dtype=np.int32),
@@ -538,7 +538,7 @@ def test_points_of_other_names_in_the_cell_that_the_directory_names_are_not_take
 def rays_at(images: ImageSet, grounds: Sequence[Array], sigma: Sequence[float] | None = None) -> LooseRays:
     """One exact ray of point ``p`` in each image, each towards a ground point (1, 3) of its own."""
     n = len(grounds)
-    return LooseRays(
+    return LooseRays.of(
         np.full(n, "p"), np.arange(ROW, ROW + n, dtype=np.int32), np.concatenate([exactly(g, k, images) for k, g in enumerate(grounds)]),
         np.repeat(np.array(sigma or [0.3] * n)[:, None], 2, axis=1), np.ones(n, dtype=np.bool_), np.arange(n, dtype=np.int32),
     )  # fmt: skip
