@@ -237,7 +237,8 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     shared = executor.share(list(move.images))
     origins = _origins(move)
     arguments = []
-    for tile in tiles:
+    # the largest first: at the end no worker is left with much to do while others wait
+    for tile in sorted(tiles, key=lambda tile: -sum(len(arrivals[c].image) for c in move.cover.cells_held(tile) if c in arrivals)):
         held = move.cover.cells_held(tile)
         arguments.append((
             session.fork(), tile, cover,  # a fork each: a task must see the last version, not what another task writes
@@ -245,7 +246,7 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
             {c: origins[c] for c in move.cover.cells_owned(tile) if c in origins}, shared,
         ))  # fmt: skip
     handles = executor.submit_all(update_tile, arguments, "update-tile", reporter.stage("summing tiles", len(tiles)))
-    reports: list[TileReport] = executor.results(handles)
+    reports: list[TileReport] = sorted(executor.results(handles), key=lambda report: report.tile)
     by_tile = {report.tile: report for report in reports}
 
     before = base.flags()

@@ -14,7 +14,7 @@ import zarr
 from orchestration.batch import Rejected, block_rays
 from orchestration.control import ControlAdded, RejectedPoint
 from orchestration.dense_blocks import control_members, free_points
-from orchestration.executors import own_peak_memory_mb
+from orchestration.memory import own_peak_memory_mb
 from orchestration.progress import Reporter, Silent
 from orchestration.run import DEFAULT_BATCH_BLOCKS, check_frames
 from orchestration.withdraw import Withdrawn

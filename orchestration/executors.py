@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-import resource
 import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from orchestration.memory import own_peak_memory_mb
+from orchestration.task_record import TaskRecord, added, recorded, taken_notes
 from submin.adjustment.warm_up import compile_kernels
 from submin.errors import ClusterError, InputError, KilledTaskError
 
@@ -64,14 +64,9 @@ class Executor(Protocol):
         """Largest resident memory so far, megabytes: this process and its workers together."""
         ...
 
-
-def own_peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, megabytes."""
-    try:  # getrusage would count what the process that started this one had
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024.0
-    except (OSError, StopIteration):
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    def task_records(self) -> dict[str, TaskRecord]:
+        """What tasks took by their names since this was asked last; those of lost workers are not told."""
+        ...
 
 
 class SerialExecutor:
@@ -87,13 +82,13 @@ class SerialExecutor:
         """See `Executor.submit_all`."""
         done = []
         for args in arguments:
-            done.append(function(*args))
+            done.append(recorded(name, function, *args))
             advance()
         return done
 
     def submit(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
         """See `Executor.submit`."""
-        return function(*arguments)
+        return recorded(name, function, *arguments)
 
     def wait(self, handles: Sequence[Any], advance: Advance) -> None:
         """See `Executor.wait`."""
@@ -102,7 +97,7 @@ class SerialExecutor:
 
     def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
         """See `Executor.stream`."""
-        return (function(*args) for args in arguments)
+        return (recorded(name, function, *args) for args in arguments)
 
     def attempt_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
         """See `Executor.attempt_all`. Nothing outlives a crash here."""
@@ -115,6 +110,10 @@ class SerialExecutor:
     def peak_memory_mb(self) -> float:
         """See `Executor.peak_memory_mb`."""
         return own_peak_memory_mb()
+
+    def task_records(self) -> dict[str, TaskRecord]:
+        """See `Executor.task_records`."""
+        return taken_notes()
 
 
 class DaskExecutor:
@@ -180,7 +179,7 @@ class DaskExecutor:
             return self._start(function, arguments, name)
 
     def _start(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
-        return self.client.submit(function, *arguments, pure=False, key=f"{name}-{os.urandom(6).hex()}")
+        return self.client.submit(recorded, name, function, *arguments, pure=False, key=f"{name}-{os.urandom(6).hex()}")
 
     def wait(self, handles: Sequence[Any], advance: Advance) -> None:
         """See `Executor.wait`."""
@@ -221,6 +220,12 @@ class DaskExecutor:
         with self._losses_said():
             self._check_scheduler()
             return own_peak_memory_mb() + float(sum(self.client.run(own_peak_memory_mb, on_error="ignore").values()))
+
+    def task_records(self) -> dict[str, TaskRecord]:
+        """See `Executor.task_records`."""
+        with self._losses_said():
+            self._check_scheduler()
+            return added(self.client.run(taken_notes, on_error="ignore").values())
 
     @contextmanager
     def _losses_said(self) -> Iterator[None]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
+from orchestration.task_record import TaskRecord
 from submin.adjustment.symmetric import between, fill_symmetric
 from submin.errors import InputError
 from submin.network.outside_messages import Elimination, Message, State, complete, eliminate, front_of
@@ -48,6 +49,7 @@ class ReconcileResult:
     ----------
     version : of the network afterwards; tiles : reconciled, untouched : whose states stand as they are
     parts : connected parts of the network; largest_front : vectors of the largest front
+    tasks : what tasks took, by their names
     """
 
     version: str
@@ -57,10 +59,11 @@ class ReconcileResult:
     largest_front: int
     seconds: float
     peak_memory_mb: float
+    tasks: Mapping[str, TaskRecord]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, as programs rely on them."""
-        return dict(vars(self))
+        return {**vars(self), "tasks": {name: record.to_json() for name, record in sorted(self.tasks.items())}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,14 @@ def reconcile(place: str, executor: Executor, reporter: Reporter | None = None) 
             root.attrs["version"] = version
             commit(session, version, f"{len(vectors) - untouched} tiles reconciled")
     return ReconcileResult(
-        f"v{version}", len(vectors) - untouched, untouched, len(trees), front, time.monotonic() - started, executor.peak_memory_mb()
+        f"v{version}",
+        len(vectors) - untouched,
+        untouched,
+        len(trees),
+        front,
+        time.monotonic() - started,
+        executor.peak_memory_mb(),
+        executor.task_records(),
     )
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import chain, islice
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
+from orchestration.read_ahead import batches_ahead
+from orchestration.task_record import TaskRecord
 from orchestration.tasks import FlaggedImage
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import InputError
@@ -38,6 +40,7 @@ class RunResult:
     doubtful : fused blocks that agree with the network as few good ones do
     control_fused : number of control points; observations_fused : of clusters of observations
     contradicted : surveyed points that contradict the network, with reasons
+    tasks : what tasks took, by their names
     rays_used, rays_rejected : rays in the network afterwards; ray_rms_px : residual of the used ones, per coordinate
     """
 
@@ -56,6 +59,7 @@ class RunResult:
     unsettled_tiles: tuple[str, ...]
     seconds: float
     peak_memory_mb: float
+    tasks: Mapping[str, TaskRecord]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, as programs rely on them."""
@@ -86,6 +90,7 @@ class RunResult:
             "unsettled_tiles": list(self.unsettled_tiles),
             "seconds": self.seconds,
             "peak_memory_mb": self.peak_memory_mb,
+            "tasks": {name: record.to_json() for name, record in sorted(self.tasks.items())},
         }
 
 
@@ -191,7 +196,7 @@ def fuse_blocks(
         known = Snapshot.open(place)
         tally = Tally(known.number, {row for _, row in known.flags()})
         new = _new_blocks(blocks, Ledger.of(known), tally, reporter)
-        while batch := list(islice(new, max(batch_blocks, 1))):
+        for batch in batches_ahead(new, max(batch_blocks, 1)):
             good = [block for block, reason in batch if reason is None]
             refused = [Rejected.of(block, reason) for block, reason in batch if reason is not None]
             tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, innovation, check_points))
@@ -209,6 +214,7 @@ def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -
         tuple(tally.rejected), tuple(tally.doubtful), tuple(tally.flagged[row] for row in sorted(released)), tally.contradicted,
         float(np.sqrt(square / (2.0 * in_pixels))) if in_pixels else 0.0, used, sum(cell["rays"] for cell in cells) - used,
         tuple(after.cover.tile_name(t) for t in sorted(tally.unsettled)), time.monotonic() - started, executor.peak_memory_mb(),
+        executor.task_records(),
     )  # fmt: skip
 
 

@@ -303,46 +303,44 @@ def prior_and_columns(images: Sequence[ImagePrior], parameters: int) -> tuple[sp
     m, p, columns = len(images), parameters, 0
     sets: dict[str, list[int]] = {}
     own_column: dict[tuple[int, int], int] = {}
-    blocks: dict[tuple[str, tuple[Parameter, ...]], list[int]] = {}
+    alone: list[tuple[int, int, float]] = []
+    correlated: dict[tuple[str, tuple[Parameter, ...], int], list[tuple[int, int, float]]] = {}
     shared: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for i, image in enumerate(images):
         if image.joint is not None:
             sets.setdefault(image.block_id, []).append(i)
         if image.a_priori is not None:
-            blocks.setdefault((image.block_id, image.parameters), []).append(i)
             for c, parameter in enumerate(image.parameters):
                 stated = _stated(image.a_priori, parameter)
-                if stated.sigma > 0.0:
-                    own_column[i, c], columns = columns, columns + 1
-                if stated.common_to_pass > 0.0 and stated.sigma > 0.0:
+                if not stated.sigma > 0.0:
+                    continue
+                own = stated.sigma * (RELEASE_FACTOR if image.released else np.sqrt(1.0 - stated.common_to_pass))
+                entry = i * p + c, columns, own
+                own_column[i, c], columns = columns, columns + 1
+                if stated.correlation == "none":
+                    alone.append(entry)
+                else:
+                    correlated.setdefault((image.block_id, image.parameters, c), []).append(entry)
+                if stated.common_to_pass > 0.0:
                     common = stated.sigma * np.sqrt(stated.common_to_pass)
                     shared.setdefault((image.pass_id, parameter.name), []).append((i * p + c, common))
 
     entries = _Entries()
-    for (_, names), members in blocks.items():
-        models = [model for i in members if (model := images[i].a_priori) is not None]
-        at = np.array(members)
-        seconds = np.array([images[i].seconds for i in members])
-        released = np.array([images[i].released for i in members])
-        factors: dict[tuple[str, float], Array] = {}
-        for c, parameter in enumerate(names):
-            # one model for the block, but a shift stated in metres has each image's own size in pixels
-            stated = _stated(models[0], parameter)
-            if not stated.sigma > 0.0:
-                continue
-            sigma = np.array([_stated(model, parameter).sigma for model in models])
-            key = stated.correlation, stated.correlation_parameter
-            if key not in factors:
-                factors[key] = _own_factor(stated, seconds, released)
-            own = sigma * np.where(released, RELEASE_FACTOR, np.sqrt(1.0 - stated.common_to_pass))
-            entries.add(at * p + c, np.array([own_column[i, c] for i in members]), factors[key] * own[:, None])
-    for k, members_of_pass in enumerate(shared.values()):
-        rows, sigmas = zip(*members_of_pass, strict=True)
-        entries.add(np.array(rows), np.array([columns + k]), np.array(sigmas)[:, None])
+    entries.add_single(alone)
+    for (_, parameters_of, c), of_block in correlated.items():
+        rows, own_columns, own_sigmas = map(np.array, zip(*of_block, strict=True))
+        members = [images[row // p] for row in rows.tolist()]
+        # one model of the correlation for the block, but a shift stated in metres has each image's own size in pixels
+        first = members[0]
+        assert first.a_priori is not None
+        stated = _stated(first.a_priori, parameters_of[c])
+        seconds, released = np.array([image.seconds for image in members]), np.array([image.released for image in members])
+        entries.add(rows, own_columns, _own_factor(stated, seconds, released) * own_sigmas[:, None])
+    entries.add_single([(row, columns + k, sigma) for k, of_pass in enumerate(shared.values()) for row, sigma in of_pass])
     columns += len(shared)
     widths = []
-    for block_id, members in sets.items():
-        views = [(i, joint.rows) for i in members if (joint := images[i].joint) is not None]
+    for block_id, of_set in sets.items():
+        views = [(i, joint.rows) for i in of_set if (joint := images[i].joint) is not None]
         factor = marginal_factor(np.concatenate([rows for _, rows in views]))
         at = np.concatenate([i * p + np.arange(len(rows)) for i, rows in views])
         entries.add(at, columns + np.arange(factor.shape[1]), factor)
@@ -359,7 +357,7 @@ def prior_variance(prior: sp.csr_array, parameters: int) -> Array:
     return variance.reshape(-1, parameters)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=1 << 14)
 def _stated(model: APriori, parameter: Parameter) -> Uncertainty:
     return model.of(parameter)
 
@@ -370,8 +368,6 @@ def _own_factor(stated: Uncertainty, seconds: Array, released: NDArray[np.bool_]
     What a bad camera does says nothing of its neighbours: correlated at a hundred times the sigma, it would pin them.
     """
     correlation = stated.correlations(seconds)
-    if stated.correlation == "none":
-        return correlation
     alone = released[:, None] | released[None, :]
     np.fill_diagonal(alone, False)
     return correlation_factor(np.where(alone, 0.0, correlation))
@@ -390,6 +386,14 @@ class _Entries:
         self._rows.append(np.repeat(rows, len(columns)))
         self._columns.append(np.tile(columns, len(rows)))
         self._values.append(values.ravel())
+
+    def add_single(self, entries: Sequence[tuple[int, int, float]]) -> None:
+        """Rows, columns and values one by one."""
+        if entries:
+            rows, columns, values = zip(*entries, strict=True)
+            self._rows.append(np.array(rows))
+            self._columns.append(np.array(columns))
+            self._values.append(np.array(values))
 
     def factor(self, shape: tuple[int, int]) -> sp.csr_array:
         """The whole matrix, without stored zeros."""

@@ -77,7 +77,7 @@ def test_what_the_tile_knows_of_the_block_is_that_of_the_joined_network(others: 
     """From stored covariances, against the tile factored again with the block's images joined to it."""
     block = block_rays(blocks[LAST])
     network = submin.open(others)
-    ids = np.unique(block.point_ids)
+    ids = block.ids
     cells = network.snapshot.candidate_cells(ids)
     images = image_set(block.images, network.cover.ellipsoid, 6)
     passes = network.snapshot.image_columns(["pass_id"])["pass_id"]

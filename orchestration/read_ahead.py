@@ -1,0 +1,23 @@
+"""What comes next is made while what came last is worked on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def batches_ahead(values: Iterable[T], size: int) -> Iterator[list[T]]:
+    """Values in lists of so many, the last one shorter; a thread makes the next list while one is worked on, and not more than that.
+
+    An error of ``values`` is raised where their list would come.
+    """
+    left = iter(values)
+    with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as reader:
+        following = reader.submit(lambda: list(islice(left, size)))
+        while batch := following.result():
+            following = reader.submit(lambda: list(islice(left, size)))
+            yield batch
