@@ -7,6 +7,7 @@ import os
 import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, Protocol, TypeVar
@@ -114,6 +115,27 @@ class SerialExecutor:
     def task_records(self) -> dict[str, TaskRecord]:
         """See `Executor.task_records`."""
         return taken_notes()
+
+
+class ThreadExecutor(SerialExecutor):
+    """Runs tasks here, some side by side: for small work that is not worth a cluster. Compiled kernels, BLAS and reads do not wait."""
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+
+    def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
+        """See `Executor.submit_all`."""
+        with ThreadPoolExecutor(self._threads, thread_name_prefix=name) as pool:
+            handles = [pool.submit(recorded, name, function, *args) for args in arguments]
+            try:
+                done = []
+                for handle in handles:
+                    done.append(handle.result())
+                    advance()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            return done
 
 
 class DaskExecutor:
@@ -260,7 +282,7 @@ def _same(value: T) -> T:
 
 @contextmanager
 def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Executor]:
-    """Serial for no workers; a local cluster of so many processes, one BLAS thread each; or the cluster at an address.
+    """Threads of this process for no workers; a local cluster of so many processes, one BLAS thread each; or the cluster at an address.
 
     Raises
     ------
@@ -268,7 +290,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         When no scheduler answers at the address.
     """
     if scheduler is None and workers <= 0:
-        yield SerialExecutor()
+        yield ThreadExecutor(os.cpu_count() or 1)
         return
     import dask
     from distributed import Client, LocalCluster

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -19,7 +20,7 @@ class TaskRecord:
     Attributes
     ----------
     tasks : their number; seconds : all of them together, longest : the longest one, by the clock
-    processor_seconds : of their processes while they ran
+    processor_seconds : of their threads while they ran
     peak_memory_mb : largest resident memory, when one of them was done, of a process since it began
     """
 
@@ -42,18 +43,19 @@ class TaskRecord:
 
 _NOTES: dict[str, TaskRecord] = {}
 """Of this process, by the name of the task."""
+_WRITING = threading.Lock()
 
 
 def recorded(name: str, function: Callable[..., T], *arguments: Any) -> T:
     """The value of a function; what it took is noted under a name."""
-    clock, processor = time.perf_counter(), time.process_time()
+    clock, processor = time.perf_counter(), time.thread_time()
     try:
         return function(*arguments)
     finally:
         seconds = time.perf_counter() - clock
-        _NOTES[name] = _NOTES.get(name, TaskRecord()) + TaskRecord(
-            1, seconds, seconds, time.process_time() - processor, own_peak_memory_mb()
-        )  # fmt: skip
+        note = TaskRecord(1, seconds, seconds, time.thread_time() - processor, own_peak_memory_mb())
+        with _WRITING:
+            _NOTES[name] = _NOTES.get(name, TaskRecord()) + note
 
 
 def taken_notes() -> dict[str, TaskRecord]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ import pytest
 from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
 
-from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, executor_for
+from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, ThreadExecutor, executor_for
+from orchestration.read_ahead import batches_ahead
 from submin.errors import ClusterError, InputError, KilledTaskError
 from submin.simulation.region import simulate_region
 from submin.storage.simulated import write_region
@@ -21,6 +23,10 @@ from submin.storage.simulated import write_region
 
 def double(value: int) -> int:
     return 2 * value
+
+
+def nap(seconds: float) -> None:
+    time.sleep(seconds)
 
 
 def fail(value: int) -> int:
@@ -48,12 +54,57 @@ def cluster() -> Iterator[LocalCluster]:
 
 def test_results_come_in_order_from_both(cluster: LocalCluster) -> None:
     with Client(cluster) as client:
-        for executor in (SerialExecutor(), DaskExecutor(client)):
+        for executor in (SerialExecutor(), ThreadExecutor(2), DaskExecutor(client)):
             steps: list[int] = []
             first = executor.submit_all(double, [(k,) for k in range(20)], "double", lambda steps=steps: steps.append(1))
             again = executor.submit_all(double, [(handle,) for handle in first], "again", lambda: None)
             assert executor.results(again) == [4 * k for k in range(20)]
             assert len(steps) == 20
+
+
+def test_what_tasks_took_is_told_once_by_their_names(cluster: LocalCluster) -> None:
+    with Client(cluster) as client:
+        for executor in (SerialExecutor(), ThreadExecutor(2), DaskExecutor(client)):
+            executor.task_records()
+            executor.submit_all(double, [(k,) for k in range(7)], "double", lambda: None)
+            executor.submit_all(nap, [(0.05,), (0.1,)], "nap", lambda: None)
+            records = executor.task_records()
+            assert {name: records[name].tasks for name in records} == {"double": 7, "nap": 2}
+            assert 0.1 <= records["nap"].longest < records["nap"].seconds
+            assert records["nap"].seconds >= 0.15 and records["nap"].processor_seconds < 0.15
+            assert records["double"].peak_memory_mb > 1.0
+            assert executor.task_records() == {}
+
+
+def test_threads_stop_at_an_error_and_say_it() -> None:
+    begun: list[int] = []
+
+    def some_fail(value: int) -> int:
+        begun.append(value)
+        return fail(value) if value == 3 else double(value)
+
+    with pytest.raises(InputError, match="value 3 is not wanted"):
+        ThreadExecutor(1).submit_all(some_fail, [(k,) for k in range(100)], "some", lambda: None)
+    assert begun[-1] < 99
+
+
+def test_batches_come_in_order_one_ahead_and_errors_where_they_are() -> None:
+    taken: list[int] = []
+
+    def values() -> Iterator[int]:
+        for value in range(10):
+            taken.append(value)
+            yield value
+        raise InputError("the catalogue ends badly")
+
+    found = []
+    with pytest.raises(InputError, match="ends badly"):
+        for batch in batches_ahead(values(), 4):
+            found.append(batch)
+            assert len(taken) <= 4 * (len(found) + 1)
+    assert found == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert list(batches_ahead(iter(range(5)), 2)) == [[0, 1], [2, 3], [4]]
+    assert list(batches_ahead([], 2)) == []
 
 
 def test_a_stream_comes_in_order_and_is_bounded(cluster: LocalCluster) -> None:

@@ -20,12 +20,15 @@ from submin.adjustment.priors import APriori, ImagePrior
 from submin.adjustment.rays import sorted_rays
 from submin.geodesy import geocentric_to_geodetic, geodetic_to_geocentric
 from submin.network.cell import Cell, RegisteredPoints, empty_cell, summed, with_points, without_points
+from submin.network.id_numbers import numbered
 from submin.network.registration import (
     IN_THE_NETWORK,
     SAME_POINT_METRES,
     LooseRays,
     Registration,
+    by_points,
     contradictions,
+    joined,
     register,
     taken_out,
     together,
@@ -517,6 +520,36 @@ def test_company_does_not_matter(seed: int) -> None:
         np.testing.assert_array_equal(alone.arrivals[int(number)].origin[0], origin[str(point)])
         np.testing.assert_array_equal(alone.passing, whole.passing[mine])
         np.testing.assert_array_equal(alone.outside, whole.outside[mine])
+
+
+@EXAMPLES
+@given(SEEDS, st.integers(1, 40))
+def test_parts_put_together_are_the_whole(seed: int, parts: int) -> None:
+    rays = Blocks.random(seed, 0.2).some(range(5))
+    whole = register(rays, IMAGES, ROWS, COVER)
+    rows = by_points(rays, parts)
+    assert sorted(np.concatenate(rows).tolist()) == list(range(len(rays)))
+    found = joined([register(rays.take(part), IMAGES, ROWS, COVER) for part in rows], rows)
+    for name in ("passing", "outside"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    for k in range(2):
+        np.testing.assert_array_equal(found.directory[k], whole.directory[k])
+    assert found.arrivals.keys() == whole.arrivals.keys()
+    for number, points in found.arrivals.items():
+        expected = whole.arrivals[number]
+        np.testing.assert_array_equal(points.point_ids, expected.point_ids)
+        np.testing.assert_array_equal(points.origin, expected.origin)
+        mine, theirs = (sorted(zip(p.point, p.image, *p.observed.T, *p.sigma.T, strict=True)) for p in (points, expected))
+        assert mine == theirs
+
+
+@EXAMPLES
+@given(st.lists(st.text(max_size=4).filter(lambda text: "\0" not in text), max_size=30))
+def test_numbers_of_texts_are_those_of_unique(texts: list[str]) -> None:
+    expected, place = np.unique(np.array(texts, dtype=np.str_), return_inverse=True)
+    found, at = numbered(np.array(texts, dtype=np.str_))
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(at, place)
 
 
 @pytest.mark.parametrize("twin", ["a twin", "twin"])
