@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.images import ImageSet
-from submin.adjustment.point_basis import gather, most_rays, orthonormal, remove_ground
+from submin.adjustment.point_basis import by_images, gather, most_rays, orthonormal, remove_ground, same_images
 from submin.adjustment.rays import Rays
 
 Array = NDArray[np.float64]
@@ -128,6 +128,24 @@ def _whiten(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _spread(seen: Index, n: int, p: int, local: Array, information: Array) -> None:
+    """Add the lower triangle ``local`` about the n images ``seen`` to that about all; zero it."""
+    for a in range(n):
+        for s in range(a + 1):
+            at, to = seen[a] * p, seen[s] * p
+            for u in range(p):
+                for v in range(u + 1 if a == s else p):
+                    part = local[a * p + u, s * p + v]
+                    local[a * p + u, s * p + v] = 0.0
+                    if at + u >= to + v:
+                        information[at + u, to + v] += part
+                    else:
+                        information[to + v, at + u] += part
+                    if at == to and a != s and u == v:  # two rays of a point in one image
+                        information[at + u, to + v] += part
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _eliminate(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, information: Array, vector: Array
 ) -> tuple[float, int]:
@@ -135,9 +153,11 @@ def _eliminate(
     most = most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
-    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
+    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((3, most * p))
+    local, seen, count = np.zeros((most * p, most * p)), np.empty(most, np.int32), 0
     misclosure, redundancy = 0.0, 0
-    for j in range(len(first) - 1):
+    # points that the same images see come together: what they say is summed in the cache, and spread once
+    for j in by_images(first, image, weight):
         n = gather(j, first, weight, by_ground, y, rays, root, b, t)
         if n == 0:
             continue
@@ -151,28 +171,28 @@ def _eliminate(
         remove_ground(q, rank, 2 * n, t)
         for i in range(2 * n):
             misclosure += t[i] * t[i]
+        if not same_images(n, rays, image, count, seen):
+            _spread(seen, count, p, local, information)
+            count = n
+            for a in range(n):
+                seen[a] = image[rays[a]]
+        for e in range(rank, 3):
+            z[e, : n * p] = 0.0
         for a in range(n):
             i = rays[a]
-            at = image[i] * p
+            at, to = image[i] * p, a * p
             for u in range(p):
                 a0, a1 = root[a] * by_parameters[i, 0, u], root[a] * by_parameters[i, 1, u]
                 vector[at + u] += a0 * t[2 * a] + a1 * t[2 * a + 1]
                 for e in range(rank):
-                    z[a, e, u] = q[2 * a, e] * a0 + q[2 * a + 1, e] * a1
+                    z[e, to + u] = q[2 * a, e] * a0 + q[2 * a + 1, e] * a1
                 for v in range(u + 1):
-                    information[at + u, at + v] += root[a] * (a0 * by_parameters[i, 0, v] + a1 * by_parameters[i, 1, v])
-        for a in range(n):
-            at = image[rays[a]] * p
-            for c in range(n):
-                to = image[rays[c]] * p
-                if to > at:
-                    continue
-                for u in range(p):
-                    for v in range(u + 1 if to == at else p):
-                        total = 0.0
-                        for e in range(rank):
-                            total += z[a, e, u] * z[c, e, v]
-                        information[at + u, to + v] -= total
+                    local[to + u, to + v] += root[a] * (a0 * by_parameters[i, 0, v] + a1 * by_parameters[i, 1, v])
+        for i in range(n * p):
+            row, z0, z1, z2 = local[i], z[0, i], z[1, i], z[2, i]
+            for k in range(i + 1):
+                row[k] -= z0 * z[0, k] + z1 * z[1, k] + z2 * z[2, k]
+    _spread(seen, count, p, local, information)
     return misclosure, redundancy
 
 

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.point_basis import complement, gather, most_rays, orthonormal, remove_ground
+from submin.adjustment.point_basis import by_images, complement, gather, most_rays, orthonormal, remove_ground
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -308,7 +308,7 @@ def snoop(
         np.empty((3, 2 * most)),
     )
     own = np.empty(2 * most)
-    for j in range(len(first) - 1):
+    for j in by_images(first, image, weight):  # the numbers of M that they need stay in the cache
         while True:
             n = gather(j, first, weight, by_ground, y, rays, root, b, t)
             if n < 2:
