@@ -25,11 +25,10 @@ from submin.adjustment.blunders import (
 from submin.adjustment.elimination import (
     LinearRays,
     eliminate,
-    ground_corrections,
     linearise,
     moved_by_ground,
     moved_rays,
-    point_factors,
+    placed,
     residuals_of,
 )
 from submin.adjustment.estimation import ImageEstimate, estimate_images
@@ -284,12 +283,12 @@ def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, reach: 
     sums = eliminate(linear, weight, len(images))
     estimate = estimate_images(sums, images.prior, images.parameters)
     placing = _placing(rays, weight, state.seen)
-    factors = point_factors(linear, placing)
-    offset = state.ground + ground_corrections(factors, linear, estimate.theta) - anchor
+    determined, correction = placed(linear, placing, estimate.theta)
+    offset = state.ground + correction - anchor
     distance = np.linalg.norm(offset, axis=1)
     offset *= (reach / np.maximum(distance, reach))[:, None]
     # a point that stays, or is held back, is not where its rays want it: it does not tell whether the step was good
-    moves = placing * (factors.rank == 3)[rays.point]
+    moves = placing * determined[rays.point]
     free = weight * (moves > 0.0) * (distance <= reach)[rays.point]
     reached, shortened = _shortened(images, rays, state, moves, free, estimate, anchor + offset)
     return _Step(reached, estimate, noise_bound(estimate.chi_square, sums.redundancy), shortened)

@@ -316,6 +316,47 @@ def point_covariances(first: Offsets, image: Index, factors: PointFactors, covar
     return np.asarray(_point_covariances(first, image, factors.own, factors.loading, covariance))
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _placed(
+    first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, theta: Array
+) -> tuple[NDArray[np.bool_], Array]:
+    points, p, most = len(first) - 1, by_parameters.shape[2], most_rays(first)
+    determined, correction = np.zeros(points, np.bool_), np.zeros((points, 3))
+    rays, root = np.empty(most, np.int64), np.empty(most)
+    b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
+    r, pivot, at = np.empty((3, 3)), np.empty(3, np.int32), np.empty(3)
+    for j in range(points):
+        n = gather(j, first, weight, by_ground, y, rays, root, b, t)
+        if n == 0 or orthonormal(b, 2 * n, q, r, pivot) < 3:
+            continue
+        determined[j] = True
+        at[:] = 0.0
+        for a in range(n):
+            i = rays[a]
+            for c in range(2):
+                left = 0.0
+                for u in range(p):
+                    left += by_parameters[i, c, u] * theta[image[i], u]
+                left = t[2 * a + c] - root[a] * left
+                for e in range(3):
+                    at[e] += q[2 * a + c, e] * left
+        at[2] /= r[2, 2]
+        at[1] = (at[1] - r[1, 2] * at[2]) / r[1, 1]
+        at[0] = (at[0] - r[0, 1] * at[1] - r[0, 2] * at[2]) / r[0, 0]
+        for e in range(3):
+            correction[j, pivot[e]] = at[e]
+    return determined, correction
+
+
+def placed(linear: LinearRays, weight: Array, theta: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Which points (n,) their rays (weight (r,) above 0) determine, and ``x - x0`` (n, 3) in metres, given the images' corrections (m, p).
+
+    The same as `ground_corrections` of `point_factors`, without the loadings; 0 for points that are not determined.
+    """
+    determined, correction = _placed(linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta)
+    return np.asarray(determined), np.asarray(correction)
+
+
 def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) -> Array:
     """Estimated ``x - x0`` (n, 3) in metres, given the images' corrections (m, p); 0 for points that are not determined."""
     by_ray = np.einsum("rcp,rp->rc", factors.loading, theta[linear.image])
@@ -326,15 +367,35 @@ def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) 
     return corrections
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _moved(image: Index, by_parameters: Array, theta: Array) -> Array:
+    moved = np.zeros(by_parameters.shape[:2])
+    for r in range(len(image)):
+        for u in range(by_parameters.shape[2]):
+            for c in range(2):
+                moved[r, c] += by_parameters[r, c, u] * theta[image[r], u]
+    return moved
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _moved_by_ground(first: Offsets, by_ground: Array, correction: Array) -> Array:
+    moved = np.zeros(by_ground.shape[:2])
+    for j in range(len(first) - 1):
+        for r in range(first[j], first[j + 1]):
+            for c in range(2):
+                for k in range(3):
+                    moved[r, c] += by_ground[r, c, k] * correction[j, k]
+    return moved
+
+
 def moved_rays(linear: LinearRays, theta: Array) -> Array:
     """By how much (r, 2), in sigmas, image corrections (m, p) move the image coordinates of rays."""
-    return np.asarray(np.einsum("rcp,rp->rc", linear.by_parameters, theta[linear.image]))
+    return np.asarray(_moved(linear.image, linear.by_parameters, theta))
 
 
 def moved_by_ground(linear: LinearRays, correction: Array) -> Array:
     """By how much (r, 2), in sigmas, shifts (n, 3) of the points in metres move the image coordinates of their rays."""
-    point = np.repeat(np.arange(len(correction)), np.diff(linear.first))
-    return np.asarray(np.einsum("rck,rk->rc", linear.by_ground, correction[point]))
+    return np.asarray(_moved_by_ground(linear.first, linear.by_ground, correction))
 
 
 def residuals_of(linear: LinearRays, theta: Array, correction: Array) -> Array:
