@@ -194,15 +194,15 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         last, before, state = state, weight, step.state
         if step.shortened:  # far from the solution nothing can be judged
             continue
-        theta, covariance = state.theta, step.estimate.covariance
+        theta = state.theta
         moved = np.abs(moved_rays(state.linear, theta - last.theta)[state.seen]).max(initial=0.0)
         # while images move, what contradicts a point may be their doing: then only the likeliest blunder goes, with no doubt about it
         judgeable = np.where(state.seen, candidates if judgements <= FREE_DECISIONS else weight, 0.0)
         if not (sure and moved < NEAR_ENOUGH_SIGMAS and _farthest(last, state, weight) < NEAR_ENOUGH_SIGMAS):
             doubt = step.noise if moved < NEAR_SIGMAS else 0.0
-            judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, doubt, weight, testable)
+            judged, statistic = reject_blunders(state.linear, judgeable, theta, step.estimate.covariance, doubt, weight, testable)
             judged = worst_of_sets(judged, weight, statistic, of_set, rays.point)
-        worst = image_statistics(theta, covariance, np.where(camera[:, None], images.prior_variance, 0.0))
+        worst = image_statistics(theta, step.estimate.variance, np.where(camera[:, None], images.prior_variance, 0.0))
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         restless = judgements % PATIENCE == 0 and np.count_nonzero(judged != weight) > RESTLESS * len(rays)

@@ -7,6 +7,7 @@ import scipy.sparse as sp
 
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.elimination import linearise, point_factors
+from submin.adjustment.estimation import variances_of
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
@@ -36,6 +37,7 @@ def compile_kernels() -> None:
     ground = intersect(images, rays, 2)
     adjust(images, rays, ground)
     point_factors(linearise(images, rays, np.zeros((2, images.parameters)), ground, ground), np.ones(4))  # what a cell keeps of its points
+    variances_of(np.eye(2, order="F"), sp.eye_array(2, format="csr"))
     # the sums of a tile are large and sparse, which those of two images are not
     many = DENSE_SIZE + 1
     add_into(np.zeros((many, many)), permuted(np.eye(many), np.arange(many), 1), np.arange(many), 1)
