@@ -25,11 +25,10 @@ from submin.adjustment.blunders import (
 from submin.adjustment.elimination import (
     LinearRays,
     eliminate,
-    ground_corrections,
     linearise,
     moved_by_ground,
     moved_rays,
-    point_factors,
+    placed,
     residuals_of,
 )
 from submin.adjustment.estimation import ImageEstimate, estimate_images
@@ -195,15 +194,15 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         last, before, state = state, weight, step.state
         if step.shortened:  # far from the solution nothing can be judged
             continue
-        theta, covariance = state.theta, step.estimate.covariance
+        theta = state.theta
         moved = np.abs(moved_rays(state.linear, theta - last.theta)[state.seen]).max(initial=0.0)
         # while images move, what contradicts a point may be their doing: then only the likeliest blunder goes, with no doubt about it
         judgeable = np.where(state.seen, candidates if judgements <= FREE_DECISIONS else weight, 0.0)
         if not (sure and moved < NEAR_ENOUGH_SIGMAS and _farthest(last, state, weight) < NEAR_ENOUGH_SIGMAS):
             doubt = step.noise if moved < NEAR_SIGMAS else 0.0
-            judged, statistic = reject_blunders(state.linear, judgeable, theta, covariance, doubt, weight, testable)
+            judged, statistic = reject_blunders(state.linear, judgeable, theta, step.estimate.covariance, doubt, weight, testable)
             judged = worst_of_sets(judged, weight, statistic, of_set, rays.point)
-        worst = image_statistics(theta, covariance, np.where(camera[:, None], images.prior_variance, 0.0))
+        worst = image_statistics(theta, step.estimate.variance, np.where(camera[:, None], images.prior_variance, 0.0))
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         restless = judgements % PATIENCE == 0 and np.count_nonzero(judged != weight) > RESTLESS * len(rays)
@@ -284,12 +283,12 @@ def _advance(images: ImageSet, rays: Rays, state: _State, anchor: Array, reach: 
     sums = eliminate(linear, weight, len(images))
     estimate = estimate_images(sums, images.prior, images.parameters)
     placing = _placing(rays, weight, state.seen)
-    factors = point_factors(linear, placing)
-    offset = state.ground + ground_corrections(factors, linear, estimate.theta) - anchor
+    determined, correction = placed(linear, placing, estimate.theta)
+    offset = state.ground + correction - anchor
     distance = np.linalg.norm(offset, axis=1)
     offset *= (reach / np.maximum(distance, reach))[:, None]
     # a point that stays, or is held back, is not where its rays want it: it does not tell whether the step was good
-    moves = placing * (factors.rank == 3)[rays.point]
+    moves = placing * determined[rays.point]
     free = weight * (moves > 0.0) * (distance <= reach)[rays.point]
     reached, shortened = _shortened(images, rays, state, moves, free, estimate, anchor + offset)
     return _Step(reached, estimate, noise_bound(estimate.chi_square, sums.redundancy), shortened)

@@ -136,14 +136,14 @@ def noise_bound(chi_square: float, redundancy: int) -> float:
     return float(min(1.0, chi_square / least)) if least > 0.0 else 1.0
 
 
-def image_statistics(theta: Array, covariance: Array, prior_variance: Array) -> Array:
+def image_statistics(theta: Array, variance: Array, prior_variance: Array) -> Array:
     """Test statistic (m, p) of each image's correction against its a priori model: ``theta / sqrt(Q - M)``, 0 where it cannot be tested.
 
     Parameters
     ----------
-    theta : (m, p) estimated corrections; covariance : (m p, m p), a posteriori; prior_variance : (m, p), diagonal of Q
+    theta : (m, p) estimated corrections; variance : (m, p), a posteriori, diagonal of M; prior_variance : (m, p), diagonal of Q
     """
-    free = prior_variance - np.diag(covariance).reshape(theta.shape)
+    free = prior_variance - variance
     testable = free > TESTABLE * prior_variance
     return np.where(testable, np.abs(theta) / np.sqrt(np.where(testable, free, 1.0)), 0.0)
 

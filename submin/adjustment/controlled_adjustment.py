@@ -93,7 +93,7 @@ def adjust_controlled(images: ImageSet, rays: Rays, start: Array, prior_of: Call
             active &= ~(contradicting & (statistic >= COMPANY * statistic[contradicting].max()))
             continue
         variance = (prior.images**2).sum(axis=1).reshape(theta.shape)
-        tests = image_statistics(theta - prior.theta, found.covariance, variance)
+        tests = image_statistics(theta - prior.theta, np.diag(found.covariance).reshape(theta.shape), variance)
         image_statistic = np.where(released, image_statistic, tests.max(axis=1, initial=0.0))
         bad = bad_cameras(tests, linear) & ~released
         if not bad.any():

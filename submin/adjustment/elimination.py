@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin.adjustment.images import ImageSet
-from submin.adjustment.point_basis import gather, most_rays, orthonormal, remove_ground
+from submin.adjustment.point_basis import by_images, gather, most_rays, orthonormal, remove_ground, same_images
 from submin.adjustment.rays import Rays
 
 Array = NDArray[np.float64]
@@ -128,6 +128,24 @@ def _whiten(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _spread(seen: Index, n: int, p: int, local: Array, information: Array) -> None:
+    """Add the lower triangle ``local`` about the n images ``seen`` to that about all; zero it."""
+    for a in range(n):
+        for s in range(a + 1):
+            at, to = seen[a] * p, seen[s] * p
+            for u in range(p):
+                for v in range(u + 1 if a == s else p):
+                    part = local[a * p + u, s * p + v]
+                    local[a * p + u, s * p + v] = 0.0
+                    if at + u >= to + v:
+                        information[at + u, to + v] += part
+                    else:
+                        information[to + v, at + u] += part
+                    if at == to and a != s and u == v:  # two rays of a point in one image
+                        information[at + u, to + v] += part
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _eliminate(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, information: Array, vector: Array
 ) -> tuple[float, int]:
@@ -135,9 +153,11 @@ def _eliminate(
     most = most_rays(first)
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
-    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((most, 3, p))
+    r, pivot, z = np.empty((3, 3)), np.empty(3, np.int32), np.empty((3, most * p))
+    local, seen, count = np.zeros((most * p, most * p)), np.empty(most, np.int32), 0
     misclosure, redundancy = 0.0, 0
-    for j in range(len(first) - 1):
+    # points that the same images see come together: what they say is summed in the cache, and spread once
+    for j in by_images(first, image, weight):
         n = gather(j, first, weight, by_ground, y, rays, root, b, t)
         if n == 0:
             continue
@@ -151,28 +171,28 @@ def _eliminate(
         remove_ground(q, rank, 2 * n, t)
         for i in range(2 * n):
             misclosure += t[i] * t[i]
+        if not same_images(n, rays, image, count, seen):
+            _spread(seen, count, p, local, information)
+            count = n
+            for a in range(n):
+                seen[a] = image[rays[a]]
+        for e in range(rank, 3):
+            z[e, : n * p] = 0.0
         for a in range(n):
             i = rays[a]
-            at = image[i] * p
+            at, to = image[i] * p, a * p
             for u in range(p):
                 a0, a1 = root[a] * by_parameters[i, 0, u], root[a] * by_parameters[i, 1, u]
                 vector[at + u] += a0 * t[2 * a] + a1 * t[2 * a + 1]
                 for e in range(rank):
-                    z[a, e, u] = q[2 * a, e] * a0 + q[2 * a + 1, e] * a1
+                    z[e, to + u] = q[2 * a, e] * a0 + q[2 * a + 1, e] * a1
                 for v in range(u + 1):
-                    information[at + u, at + v] += root[a] * (a0 * by_parameters[i, 0, v] + a1 * by_parameters[i, 1, v])
-        for a in range(n):
-            at = image[rays[a]] * p
-            for c in range(n):
-                to = image[rays[c]] * p
-                if to > at:
-                    continue
-                for u in range(p):
-                    for v in range(u + 1 if to == at else p):
-                        total = 0.0
-                        for e in range(rank):
-                            total += z[a, e, u] * z[c, e, v]
-                        information[at + u, to + v] -= total
+                    local[to + u, to + v] += root[a] * (a0 * by_parameters[i, 0, v] + a1 * by_parameters[i, 1, v])
+        for i in range(n * p):
+            row, z0, z1, z2 = local[i], z[0, i], z[1, i], z[2, i]
+            for k in range(i + 1):
+                row[k] -= z0 * z[0, k] + z1 * z[1, k] + z2 * z[2, k]
+    _spread(seen, count, p, local, information)
     return misclosure, redundancy
 
 
@@ -296,6 +316,47 @@ def point_covariances(first: Offsets, image: Index, factors: PointFactors, covar
     return np.asarray(_point_covariances(first, image, factors.own, factors.loading, covariance))
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _placed(
+    first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, theta: Array
+) -> tuple[NDArray[np.bool_], Array]:
+    points, p, most = len(first) - 1, by_parameters.shape[2], most_rays(first)
+    determined, correction = np.zeros(points, np.bool_), np.zeros((points, 3))
+    rays, root = np.empty(most, np.int64), np.empty(most)
+    b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
+    r, pivot, at = np.empty((3, 3)), np.empty(3, np.int32), np.empty(3)
+    for j in range(points):
+        n = gather(j, first, weight, by_ground, y, rays, root, b, t)
+        if n == 0 or orthonormal(b, 2 * n, q, r, pivot) < 3:
+            continue
+        determined[j] = True
+        at[:] = 0.0
+        for a in range(n):
+            i = rays[a]
+            for c in range(2):
+                left = 0.0
+                for u in range(p):
+                    left += by_parameters[i, c, u] * theta[image[i], u]
+                left = t[2 * a + c] - root[a] * left
+                for e in range(3):
+                    at[e] += q[2 * a + c, e] * left
+        at[2] /= r[2, 2]
+        at[1] = (at[1] - r[1, 2] * at[2]) / r[1, 1]
+        at[0] = (at[0] - r[0, 1] * at[1] - r[0, 2] * at[2]) / r[0, 0]
+        for e in range(3):
+            correction[j, pivot[e]] = at[e]
+    return determined, correction
+
+
+def placed(linear: LinearRays, weight: Array, theta: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Which points (n,) their rays (weight (r,) above 0) determine, and ``x - x0`` (n, 3) in metres, given the images' corrections (m, p).
+
+    The same as `ground_corrections` of `point_factors`, without the loadings; 0 for points that are not determined.
+    """
+    determined, correction = _placed(linear.first, linear.image, weight, linear.by_ground, linear.by_parameters, linear.y, theta)
+    return np.asarray(determined), np.asarray(correction)
+
+
 def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) -> Array:
     """Estimated ``x - x0`` (n, 3) in metres, given the images' corrections (m, p); 0 for points that are not determined."""
     by_ray = np.einsum("rcp,rp->rc", factors.loading, theta[linear.image])
@@ -306,15 +367,35 @@ def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) 
     return corrections
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _moved(image: Index, by_parameters: Array, theta: Array) -> Array:
+    moved = np.zeros(by_parameters.shape[:2])
+    for r in range(len(image)):
+        for u in range(by_parameters.shape[2]):
+            for c in range(2):
+                moved[r, c] += by_parameters[r, c, u] * theta[image[r], u]
+    return moved
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _moved_by_ground(first: Offsets, by_ground: Array, correction: Array) -> Array:
+    moved = np.zeros(by_ground.shape[:2])
+    for j in range(len(first) - 1):
+        for r in range(first[j], first[j + 1]):
+            for c in range(2):
+                for k in range(3):
+                    moved[r, c] += by_ground[r, c, k] * correction[j, k]
+    return moved
+
+
 def moved_rays(linear: LinearRays, theta: Array) -> Array:
     """By how much (r, 2), in sigmas, image corrections (m, p) move the image coordinates of rays."""
-    return np.asarray(np.einsum("rcp,rp->rc", linear.by_parameters, theta[linear.image]))
+    return np.asarray(_moved(linear.image, linear.by_parameters, theta))
 
 
 def moved_by_ground(linear: LinearRays, correction: Array) -> Array:
     """By how much (r, 2), in sigmas, shifts (n, 3) of the points in metres move the image coordinates of their rays."""
-    point = np.repeat(np.arange(len(correction)), np.diff(linear.first))
-    return np.asarray(np.einsum("rck,rk->rc", linear.by_ground, correction[point]))
+    return np.asarray(_moved_by_ground(linear.first, linear.by_ground, correction))
 
 
 def residuals_of(linear: LinearRays, theta: Array, correction: Array) -> Array:

@@ -98,6 +98,51 @@ def most_rays(first: Offsets) -> int:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def by_images(first: Offsets, image: Index, weight: Array) -> Offsets:
+    """The points (n,) in an order in which those with accepted rays in the same images come together, where the first of them stood.
+
+    So the order depends neither on how images are numbered nor on rejected rays. Groups whose hashes collide are mixed.
+    """
+    points, mask = len(first) - 1, np.uint64(1)
+    while mask < 2 * points:
+        mask *= np.uint64(2)
+    slot, mask = np.full(mask, -1, np.int64), mask - np.uint64(1)
+    group, kinds, count = np.empty(points, np.int64), np.empty(points, np.uint64), np.zeros(points + 1, np.int64)
+    groups = 0
+    for j in range(points):
+        kind = np.uint64(0)
+        for i in range(first[j], first[j + 1]):
+            if not weight[i] > 0.0:
+                continue
+            kind = (kind ^ np.uint64(image[i] + 1)) * np.uint64(0x9E3779B97F4A7C15)
+            kind ^= kind >> np.uint64(29)
+        at = kind & mask
+        while slot[at] >= 0 and kinds[slot[at]] != kind:
+            at = (at + np.uint64(1)) & mask
+        if slot[at] < 0:
+            slot[at], kinds[groups] = groups, kind
+            groups += 1
+        group[j] = slot[at]
+        count[group[j] + 1] += 1
+    for g in range(groups):
+        count[g + 1] += count[g]
+    order = np.empty(points, np.int64)
+    for j in range(points):
+        order[count[group[j]]] = j
+        count[group[j]] += 1
+    return order
+
+
+@numba.njit(cache=True, error_model="numpy")
+def same_images(n: int, rays: Offsets, image: Index, count: int, seen: Index) -> bool:
+    """True when a point's n rays are in the images ``seen`` (count), in this order."""
+    same = n == count
+    for a in range(n):
+        same = same and image[rays[a]] == seen[a]
+    return same
+
+
+@numba.njit(cache=True, error_model="numpy")
 def complement(q: Array, rank: int, k: int, basis: Array) -> int:
     """Orthonormal basis (k, k - rank) of all that q (k, rank) does not span, Gram-Schmidt done twice. Returns the number of its columns."""
     for m in range(k - rank):

@@ -24,7 +24,7 @@ from submin.adjustment.estimation import ImageEstimate, estimate_images
 from submin.adjustment.images import ImageSet
 from submin.adjustment.point_basis import Array, Index, Offsets, gather, most_rays, orthonormal
 from submin.adjustment.rays import Rays
-from submin.adjustment.snooping import residual_covariance, residual_space
+from submin.adjustment.snooping import image_part, residual_variances
 from submin.adjustment.weak_geometry import convergence_angles, weak_points
 
 POWER = 0.8
@@ -36,21 +36,22 @@ BAND = 0.95
 @numba.njit(cache=True, error_model="numpy")
 def _redundancy_numbers(first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, covariance: Array) -> Array:
     """Redundancy numbers (r, 2) of accepted rays; NaN for the others."""
-    p, most = by_parameters.shape[2], most_rays(first)
+    most = most_rays(first)
     numbers, zeros = np.full((len(image), 2), np.nan), np.zeros((len(image), 2))
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
-    r, pivot, basis, inner = np.empty((3, 3)), np.empty(3, np.int32), np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most))
-    z, product, nearby = np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((most * p, most * p))
+    r, pivot, known = np.empty((3, 3)), np.empty(3, np.int32), np.empty((2 * most, 2 * most))
+    product, own = np.empty((3, 2 * most)), np.empty(2 * most)
     for j in range(len(first) - 1):
         n = gather(j, first, weight, by_ground, zeros, rays, root, b, t)
         if n == 0:
             continue
         rank = orthonormal(b, 2 * n, q, r, pivot)
-        free = residual_space(n, rays, root, image, by_parameters, q, rank, covariance, basis, z, product, nearby, inner)
+        image_part(n, rays, root, n, rays, root, image, by_parameters, covariance, True, known)
+        residual_variances(q, rank, 2 * n, known, product, own)
         for k in range(2 * n):
             nothing = b[k, 0] == 0.0 and b[k, 1] == 0.0 and b[k, 2] == 0.0  # the empty row of a view along one axis
-            numbers[rays[k // 2], k % 2] = 0.0 if nothing or 2 * n <= rank else residual_covariance(basis, inner, free, k, k)
+            numbers[rays[k // 2], k % 2] = 0.0 if nothing or 2 * n <= rank else own[k]
     return numbers
 
 

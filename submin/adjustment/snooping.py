@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.adjustment.point_basis import complement, gather, most_rays, orthonormal
+from submin.adjustment.point_basis import by_images, complement, gather, most_rays, orthonormal, remove_ground
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -115,42 +115,94 @@ def explain(variance: Array, residual: Array, n: int, critical: float, doubt: fl
     blunder[:n] = True
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def image_part(
+    n: int, rays: Offsets, root: Array, n2: int, rays2: Offsets, root2: Array, image: Index, by_parameters: Array, covariance: Array,
+    mirrored: bool, out: Array,
+) -> None:  # fmt: skip
+    """``A M A2'`` (2 n, 2 n2) of two sets of rays; ``mirrored`` when they are one, of which half has to be summed."""
+    p = by_parameters.shape[2]
+    for a in range(n):
+        by, at = by_parameters[rays[a]], image[rays[a]] * p
+        for s in range(a + 1 if mirrored else n2):
+            by2, to, part = by_parameters[rays2[s]], image[rays2[s]] * p, root[a] * root2[s]
+            c00 = c01 = c10 = c11 = 0.0
+            for x in range(p):
+                half0 = half1 = 0.0
+                for u in range(p):
+                    m = covariance[to + x, at + u]
+                    half0 += by[0, u] * m
+                    half1 += by[1, u] * m
+                c00 += half0 * by2[0, x]
+                c01 += half0 * by2[1, x]
+                c10 += half1 * by2[0, x]
+                c11 += half1 * by2[1, x]
+            out[2 * a, 2 * s], out[2 * a, 2 * s + 1] = part * c00, part * c01
+            out[2 * a + 1, 2 * s], out[2 * a + 1, 2 * s + 1] = part * c10, part * c11
+    if mirrored:
+        for i in range(2 * n):
+            for k in range(i):
+                out[k, i] = out[i, k]
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _turned(basis: Array, free: int, n: int, full: Array, basis2: Array, free2: int, n2: int, product: Array, out: Array) -> None:
+    """``N' X N2`` (free, free2) of a matrix X (2 n, 2 n2)."""
+    for e in range(free):
+        for k in range(2 * n2):
+            product[k] = 0.0
+        for i in range(2 * n):
+            part = basis[i, e]
+            for k in range(2 * n2):
+                product[k] += part * full[i, k]
+        for d in range(free2):
+            out[e, d] = 0.0
+        for k in range(2 * n2):
+            part = product[k]
+            for d in range(free2):
+                out[e, d] += part * basis2[k, d]
+
+
 @numba.njit(cache=True, error_model="numpy")
 def residual_space(
     n: int, rays: Offsets, root: Array, image: Index, by_parameters: Array, q: Array, rank: int, covariance: Array,
-    basis: Array, z: Array, product: Array, nearby: Array, inner: Array,
+    basis: Array, known: Array, product: Array, inner: Array,
 ) -> int:  # fmt: skip
     """Covariance of the residuals of a point's n rays, ``V = N inner N'`` with N the directions (2 n, m) that the point leaves free.
 
-    ``basis`` becomes N, ``inner = I - N'A M A'N`` (m, m) with M the images' covariance: fewer numbers than 2 n rows of A. Returns m.
+    ``basis`` becomes N, ``known = A M A'`` (2 n, 2 n) with M the images' covariance, ``inner = I - N' known N`` (m, m); ``product`` (2 n)
+    is work space. Returns m.
     """
-    p = by_parameters.shape[2]
-    free, size = complement(q, rank, 2 * n, basis), n * p
-    for a in range(n):
-        for s in range(n):
-            at, to = image[rays[a]] * p, image[rays[s]] * p
-            for u in range(p):
-                for x in range(p):
-                    nearby[a * p + u, s * p + x] = covariance[at + u, to + x]
+    free = complement(q, rank, 2 * n, basis)
+    image_part(n, rays, root, n, rays, root, image, by_parameters, covariance, True, known)
+    _turned(basis, free, n, known, basis, free, n, product, inner)
     for e in range(free):
-        for a in range(n):
-            for u in range(p):
-                z[e, a * p + u] = root[a] * (
-                    basis[2 * a, e] * by_parameters[rays[a], 0, u] + basis[2 * a + 1, e] * by_parameters[rays[a], 1, u]
-                )  # fmt: skip
-    for e in range(free):
-        for i in range(size):
-            product[e, i] = 0.0
-        for i in range(size):
-            part = z[e, i]
-            for k in range(size):
-                product[e, k] += part * nearby[i, k]
         for d in range(e + 1):
-            total = 1.0 if d == e else 0.0
-            for i in range(size):
-                total -= product[e, i] * z[d, i]
-            inner[e, d] = inner[d, e] = total
+            inner[e, d] = inner[d, e] = (1.0 if d == e else 0.0) - inner[e, d]
     return free
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+def residual_variances(q: Array, rank: int, k: int, known: Array, product: Array, variance: Array) -> None:
+    """Diagonal (k) of ``V = P - P X P``, ``P = I - QQ'``, of X = ``known`` (k, k), without a basis of what P leaves."""
+    for i in range(k):
+        variance[i] = 1.0 - known[i, i]
+    for e in range(rank):
+        for i in range(k):
+            product[e, i] = 0.0
+        for m in range(k):
+            part = q[m, e]
+            for i in range(k):
+                product[e, i] += part * known[m, i]
+        for i in range(k):
+            variance[i] += q[i, e] * (2.0 * product[e, i] - q[i, e])
+    for e in range(rank):
+        for d in range(rank):
+            total = 0.0
+            for m in range(k):
+                total += product[e, m] * q[m, d]
+            for i in range(k):
+                variance[i] -= q[i, e] * total * q[i, d]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -176,31 +228,12 @@ def _misclosures(n: int, rays: Offsets, root: Array, image: Index, by_parameters
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _cross(
-    n: int, rays: Offsets, z: Array, free: int, n2: int, rays2: Offsets, z2: Array, free2: int, image: Index, covariance: Array, p: int
-) -> Array:
-    """``z M z2'`` (free, free2) of two sets of rays."""
-    cross = np.zeros((free, free2))
-    for a in range(n):
-        for s in range(n2):
-            at, to = image[rays[a]] * p, image[rays2[s]] * p
-            for e in range(free):
-                for x in range(p):
-                    half = 0.0
-                    for u in range(p):
-                        half += z[e, a * p + u] * covariance[at + u, to + x]
-                    for d in range(free2):
-                        cross[e, d] += half * z2[d, s * p + x]
-    return cross
-
-
-@numba.njit(cache=True, error_model="numpy")
 def _predicted(inner: Array, e: Array, cross: Array, inner2: Array, e2: Array, free: int, free2: int) -> None:
     """Turn what a set of rays says into what it would, were the images adjusted with these rays of the point and no others of it.
 
-    ``inner`` (free, free) and ``e`` (free) are ``I - zMz'`` and the misclosures of the set, ``inner2``, ``e2`` those of the rays of the
-    point with which the images *were* adjusted. Without the point the misclosures are ``e + X inner2^-1 e2`` of covariance
-    ``C = I + zMz' + X inner2^-1 X'``, X = ``cross``; ``inner`` becomes ``C^-1`` and ``e`` becomes ``C^-1`` times them.
+    ``inner`` (free, free) and ``e`` (free) are ``I - N'A M A'N`` and the misclosures of the set, ``inner2``, ``e2`` those of the rays of
+    the point with which the images *were* adjusted. Without the point the misclosures are ``e + X inner2^-1 e2`` of covariance
+    ``C = I + N'A M A'N + X inner2^-1 X'``, X = ``cross``; ``inner`` becomes ``C^-1`` and ``e`` becomes ``C^-1`` times them.
     """
     spread, mean = np.empty((free, free)), np.empty((free, 1))
     for i in range(free):
@@ -239,6 +272,19 @@ def _along(basis: Array, free: int, k: int, t: Array, e: Array) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _tested(n: int, rays: Offsets, residual: Array, variance: Array, testable: Array, statistic: Array) -> float:
+    """Largest w of a point's n rays, of their residuals (2 n) and variances (2 n); those of the rays become their ``statistic``."""
+    worst = 0.0
+    for a in range(n):
+        i, w = rays[a], 0.0
+        for k in (2 * a, 2 * a + 1):
+            if variance[k] >= testable[i]:
+                w = max(w, abs(residual[k]) / np.sqrt(variance[k]))
+        statistic[i], worst = w, max(worst, w)
+    return worst
+
+
+@numba.njit(cache=True, error_model="numpy")
 def snoop(
     first: Offsets, image: Index, weight: Array, used: Array, by_ground: Array, by_parameters: Array, y: Array,
     theta: Array, covariance: Array, critical: float, doubt: float, testable: Array, statistic: Array,
@@ -249,17 +295,20 @@ def snoop(
     Changes ``weight``; ``statistic`` (r,) becomes each ray's last w. ``used`` (r,) is above 0 for the rays with which the images were
     adjusted: a test must not depend on them, or a ray that moves its image far would be taken back and rejected in turn.
     """
-    p = by_parameters.shape[2]
     most = most_rays(first)
     rays, root, rays2, root2 = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, blunder, limit = np.empty((3, 3)), np.empty(3, np.int32), np.empty(most, np.bool_), np.empty(most)
     basis, inner, variance = np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most))
     basis2, inner2, e, e2 = np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most)), np.empty(2 * most), np.empty(2 * most)
-    z, z2, product, nearby = (
-        np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((most * p, most * p))
-    )  # fmt: skip
-    for j in range(len(first) - 1):
+    known, cross, product, along = (
+        np.empty((2 * most, 2 * most)),
+        np.empty((2 * most, 2 * most)),
+        np.empty(2 * most),
+        np.empty((3, 2 * most)),
+    )
+    own = np.empty(2 * most)
+    for j in by_images(first, image, weight):  # the numbers of M that they need stay in the cache
         while True:
             n = gather(j, first, weight, by_ground, y, rays, root, b, t)
             if n < 2:
@@ -267,11 +316,17 @@ def snoop(
             rank = orthonormal(b, 2 * n, q, r, pivot)
             if 2 * n <= rank:
                 break
+            _misclosures(n, rays, root, image, by_parameters, theta, t)
             same = True
             for i in range(first[j], first[j + 1]):
                 same = same and (weight[i] > 0.0) == (used[i] > 0.0)
-            free = residual_space(n, rays, root, image, by_parameters, q, rank, covariance, basis, z, product, nearby, inner)
-            _misclosures(n, rays, root, image, by_parameters, theta, t)
+            if same:  # most points, and most of these pass
+                image_part(n, rays, root, n, rays, root, image, by_parameters, covariance, True, known)
+                residual_variances(q, rank, 2 * n, known, along, own)
+                remove_ground(q, rank, 2 * n, t)
+                if not _tested(n, rays, t, own, testable, statistic) > critical:
+                    break
+            free = residual_space(n, rays, root, image, by_parameters, q, rank, covariance, basis, known, product, inner)
             _along(basis, free, 2 * n, t, e)
             if not same:
                 n2 = gather(j, first, used, by_ground, y, rays2, root2, b, t)
@@ -279,23 +334,19 @@ def snoop(
                 if n2 > 0:
                     rank2 = orthonormal(b, 2 * n2, q, r, pivot)
                     free2 = residual_space(
-                        n2, rays2, root2, image, by_parameters, q, rank2, covariance, basis2, z2, product, nearby, inner2
+                        n2, rays2, root2, image, by_parameters, q, rank2, covariance, basis2, known, product, inner2
                     )  # fmt: skip
                     _misclosures(n2, rays2, root2, image, by_parameters, theta, t)
                     _along(basis2, free2, 2 * n2, t, e2)
-                cross = _cross(n, rays, z, free, n2, rays2, z2, free2, image, covariance, p)
-                _predicted(inner, e, cross, inner2, e2, free, free2)
+                image_part(n, rays, root, n2, rays2, root2, image, by_parameters, covariance, False, known)
+                _turned(basis, free, n, known, basis2, free2, n2, product, cross)
+                _predicted(inner, e, np.ascontiguousarray(cross[:free, :free2]), inner2, e2, free, free2)
             for k in range(2 * n):
                 t[k] = 0.0
                 for m in range(free):
                     t[k] += basis[k, m] * e[m]
-            worst = 0.0
-            for k in range(2 * n):
-                own = residual_covariance(basis, inner, free, k, k)
-                w = abs(t[k]) / np.sqrt(own) if own >= testable[rays[k // 2]] else 0.0
-                statistic[rays[k // 2]] = w if k % 2 == 0 else max(statistic[rays[k // 2]], w)
-                worst = max(worst, w)
-            if not worst > critical:
+                own[k] = residual_covariance(basis, inner, free, k, k)
+            if not _tested(n, rays, t, own, testable, statistic) > critical:
                 break
             for k in range(2 * n):
                 for i in range(2 * n):

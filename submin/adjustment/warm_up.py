@@ -6,6 +6,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from submin.adjustment.adjustment import adjust
+from submin.adjustment.elimination import linearise, point_factors
+from submin.adjustment.estimation import variances_of
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
@@ -32,7 +34,10 @@ def compile_kernels() -> None:
     observed = np.array([[10.0, 20.0], [10.5, 20.0], [90.0, 70.0], [90.0, 71.0]])
     image = np.array([0, 1, 0, 1], dtype=np.int32)
     rays = sorted_rays(index, image, observed, np.full((4, 2), 0.5), np.ones(4, dtype=np.bool_))
-    adjust(images, rays, intersect(images, rays, 2))
+    ground = intersect(images, rays, 2)
+    adjust(images, rays, ground)
+    point_factors(linearise(images, rays, np.zeros((2, images.parameters)), ground, ground), np.ones(4))  # what a cell keeps of its points
+    variances_of(np.eye(2, order="F"), sp.eye_array(2, format="csr"))
     # the sums of a tile are large and sparse, which those of two images are not
     many = DENSE_SIZE + 1
     add_into(np.zeros((many, many)), permuted(np.eye(many), np.arange(many), 1), np.arange(many), 1)

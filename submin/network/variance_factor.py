@@ -41,12 +41,12 @@ def _shares(
     Of the covariance of residuals of different points, which is small, only its sum of squares is known, ``V_ii`` less that of the
     point's own: it is taken for that of rays of the same group.
     """
-    p, most = by_parameters.shape[2], most_rays(first)
+    most = most_rays(first)
     zeros = np.zeros((len(image), 2))
     rays, root = np.empty(most, np.int64), np.empty(most)
     b, q, t = np.empty((2 * most, 3)), np.empty((2 * most, 3)), np.empty(2 * most)
     r, pivot, basis, inner = np.empty((3, 3)), np.empty(3, np.int32), np.empty((2 * most, 2 * most)), np.empty((2 * most, 2 * most))
-    z, product, nearby = np.empty((2 * most, most * p)), np.empty((2 * most, most * p)), np.empty((most * p, most * p))
+    known, product = np.empty((2 * most, 2 * most)), np.empty(2 * most)
     for j in range(len(first) - 1):
         n = gather(j, first, weight, by_ground, zeros, rays, root, b, t)
         if n == 0:
@@ -54,7 +54,7 @@ def _shares(
         rank = orthonormal(b, 2 * n, q, r, pivot)
         if 2 * n <= rank:
             continue
-        free = residual_space(n, rays, root, image, by_parameters, q, rank, covariance, basis, z, product, nearby, inner)
+        free = residual_space(n, rays, root, image, by_parameters, q, rank, covariance, basis, known, product, inner)
         for k in range(2 * n):
             if b[k, 0] == 0.0 and b[k, 1] == 0.0 and b[k, 2] == 0.0:  # the empty row of a view along one axis
                 continue

@@ -21,10 +21,12 @@ from submin.adjustment.elimination import (
     Sums,
     eliminate,
     ground_corrections,
+    placed,
     point_factors,
     residuals_of,
 )
 from submin.adjustment.estimation import ImageEstimate, cholesky, estimate_images, reduced_information
+from submin.adjustment.point_basis import by_images
 from submin.adjustment.priors import APriori, ImagePrior, prior_factor, prior_variance
 from submin.adjustment.symmetric import fill_symmetric
 from submin.errors import NumericalError
@@ -263,6 +265,43 @@ def test_single_rays_tell_nothing(seed: int) -> None:
     assert (alone.misclosure, alone.redundancy) == (0.0, 0)
     factors = point_factors(network.linear, network.weight)
     assert (factors.rank[single] == 2).all()
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_points_are_placed_where_their_factors_say(seed: int) -> None:
+    network = random_network(seed, rejected=0.2)
+    theta = np.random.default_rng(seed).normal(0.0, 5.0, (network.images, P))
+    factors = point_factors(network.linear, network.weight)
+    determined, correction = placed(network.linear, network.weight, theta)
+    np.testing.assert_array_equal(determined, factors.rank == 3)
+    np.testing.assert_allclose(correction, ground_corrections(factors, network.linear, theta), rtol=1e-9, atol=1e-9)
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_points_of_the_same_images_come_together_in_the_order_of_the_first(seed: int) -> None:
+    network = random_network(seed, points=60, images=3, rejected=0.2)
+    linear, accepted = network.linear, network.weight > 0.0
+    seen = [
+        tuple(linear.image[s:e][accepted[s:e]].tolist()) for s, e in zip(linear.first[:-1], linear.first[1:], strict=True)
+    ]  # fmt: skip
+    expected = sorted(range(len(seen)), key=lambda j: seen.index(seen[j]))
+    assert by_images(linear.first, linear.image, network.weight).tolist() == expected
+    # whatever the images are called
+    renamed = np.array([7, 2, 5], dtype=np.int32)[linear.image]
+    assert by_images(linear.first, renamed, network.weight).tolist() == expected
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_variances_are_the_diagonal_of_the_covariance(seed: int) -> None:
+    network = random_network(seed)
+    one, other = (
+        estimate_images(eliminate(network.linear, network.weight, network.images), sp.csr_array(network.prior), P) for _ in range(2)
+    )
+    np.testing.assert_allclose(one.variance.ravel(), np.diag(other.covariance), rtol=1e-11)
+    np.testing.assert_array_equal(other.variance.ravel(), np.diag(other.covariance))
 
 
 @EXAMPLES

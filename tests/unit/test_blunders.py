@@ -410,7 +410,7 @@ def test_robust_start_gets_near_the_truth_through_many_blunders() -> None:
 
 def bad(simulation: Simulation) -> tuple[NDArray[np.bool_], Array]:
     found = estimate(simulation)
-    statistics = image_statistics(found.theta, found.covariance, prior_variance(simulation.prior, P))
+    statistics = image_statistics(found.theta, found.variance, prior_variance(simulation.prior, P))
     return bad_cameras(statistics, simulation.linear), statistics
 
 
@@ -474,7 +474,7 @@ def test_images_that_nothing_checks_are_not_judged() -> None:
     theta = np.vstack([estimate(simulation).theta, np.full(P, 500.0)])
     variance = np.tile([100.0, 1.0, 1.0, 100.0, 1.0, 1.0], (8, 1))
     covariance = np.diag(np.concatenate([0.5 * variance[:alone].ravel(), 0.995 * variance[alone]]))
-    statistics = image_statistics(theta, covariance, variance)
+    statistics = image_statistics(theta, np.diag(covariance).reshape(theta.shape), variance)
     assert not statistics[alone].any()
     assert statistics[:alone].all()
     np.testing.assert_allclose(statistics[:alone], np.abs(theta[:alone]) / np.sqrt(0.5 * variance[:alone]), rtol=1e-12)
