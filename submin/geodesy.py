@@ -95,7 +95,7 @@ def geodetic_with_jacobian(geocentric: Array, ellipsoid: Ellipsoid = WGS84) -> t
     return _geodetic(x, ellipsoid.semimajor_axis, ellipsoid.eccentricity_squared)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _geodetic(geocentric: Array, a: float, e2: float) -> tuple[Array, Array]:
     n, degree, b = len(geocentric), np.pi / 180.0, a * np.sqrt(1.0 - e2)
     geodetic, jacobian = np.empty((n, 3)), np.empty((n, 3, 3))

@@ -30,7 +30,7 @@ ROBUST_SCALE = 2.4
 """Residual, in sigmas, at which a ray's weight has fallen to one half of the Cauchy weight's way (95 % efficiency for normal errors)."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _residuals(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, theta: Array
 ) -> tuple[Array, Array]:

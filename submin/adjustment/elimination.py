@@ -100,7 +100,7 @@ def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, 
     return LinearRays(rays.first(len(origin)), rays.image, seen.by_ground, seen.by_parameters, y)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _whiten(
     seen: Array,
     by_ground: Array,
@@ -127,7 +127,7 @@ def _whiten(
     return y
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _spread(seen: Index, n: int, p: int, local: Array, information: Array) -> None:
     """Add the lower triangle ``local`` about the n images ``seen`` to that about all; zero it."""
     for a in range(n):
@@ -145,7 +145,7 @@ def _spread(seen: Index, n: int, p: int, local: Array, information: Array) -> No
                         information[at + u, to + v] += part
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _eliminate(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, information: Array, vector: Array
 ) -> tuple[float, int]:
@@ -196,7 +196,7 @@ def _eliminate(
     return misclosure, redundancy
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _point_factors(
     first: Offsets, weight: Array, by_ground: Array, by_parameters: Array, y: Array
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
@@ -260,7 +260,7 @@ def point_factors(linear: LinearRays, weight: Array) -> PointFactors:
     return PointFactors(*_point_factors(linear.first, weight, linear.by_ground, linear.by_parameters, linear.y))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _point_covariances(first: Offsets, image: Index, own: Array, loading: Array, covariance: Array) -> Array:
     p, points, total = loading.shape[2], len(first) - 1, own.copy()
     kind = np.zeros(points, np.uint64)
@@ -316,7 +316,7 @@ def point_covariances(first: Offsets, image: Index, factors: PointFactors, covar
     return np.asarray(_point_covariances(first, image, factors.own, factors.loading, covariance))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _placed(
     first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, y: Array, theta: Array
 ) -> tuple[NDArray[np.bool_], Array]:
@@ -367,7 +367,7 @@ def ground_corrections(factors: PointFactors, linear: LinearRays, theta: Array) 
     return corrections
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _moved(image: Index, by_parameters: Array, theta: Array) -> Array:
     moved = np.zeros(by_parameters.shape[:2])
     for r in range(len(image)):
@@ -377,7 +377,7 @@ def _moved(image: Index, by_parameters: Array, theta: Array) -> Array:
     return moved
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _moved_by_ground(first: Offsets, by_ground: Array, correction: Array) -> Array:
     moved = np.zeros(by_ground.shape[:2])
     for j in range(len(first) - 1):

@@ -81,7 +81,7 @@ def covariance_of(factor: Array, prior: sp.csr_array) -> Array:
     return between(prior, fill_symmetric(np.asarray(inverse)).T)  # the transpose is in C order, and the same
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _squares(first: Index, column: Index, value: Array, inverse: Array, out: Array) -> None:
     """Squared lengths of the rows of ``K X'``, X lower triangular; ``inverse`` is X', its upper triangle."""
     row = np.empty(len(inverse))

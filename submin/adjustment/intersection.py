@@ -18,7 +18,7 @@ HEIGHT_SIGMA = 2000.0
 ITERATIONS = 8
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _steps(first: Offsets, image: Array, by_ground: Array, observed: Array, sigma: Array, hold: Array, back: Array) -> Array:
     """Gauss-Newton steps (n, 3) of points from their rays, held along ``hold`` (n, 3) at ``back`` (n, 3): a 3 x 3 Cholesky solve each."""
     points = len(first) - 1

@@ -92,7 +92,7 @@ class NewRays:
         return np.bincount(np.repeat(np.arange(points), np.diff(self.linear.first))[rays], minlength=points)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _work(most: int, p: int) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:
     """Arrays for the point with most rays: see `_rows_of_point`."""
     wide = 2 * most + 3
@@ -102,7 +102,7 @@ def _work(most: int, p: int) -> tuple[Array, Array, Array, Array, Array, Array, 
     )  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _rows_of_point(
     j: int, first: Rows, known: Array, new: Array, by_ground: Array, by_parameters: Array, y: Array,
     work: tuple[Array, Array, Array, Array, Array, Array, Array, Array], rays: Rows, root: Array, r: Array, pivot: Index,
@@ -151,7 +151,7 @@ def _rows_of_point(
     return free, m + n, redundancy + free if free else 0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _write_rows(
     first: Rows, at: Rows, known: Array, new: Array, by_ground: Array, by_parameters: Array, y: Array, design: Array, observed: Array
 ) -> tuple[int, int]:
@@ -172,7 +172,7 @@ def _write_rows(
     return row, redundancy
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sum_rows(
     first: Rows, at: Rows, known: Array, new: Array, by_ground: Array, by_parameters: Array, y: Array, information: Array, vector: Array
 ) -> tuple[float, int]:  # fmt: skip

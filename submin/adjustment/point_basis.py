@@ -18,7 +18,7 @@ ROUND_OFF = 1e-13
 """A direction of B below this part of the largest one is round-off."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def orthonormal(b: Array, k: int, q: Array, r: Array, pivot: Index) -> int:
     """Pivoted Gram-Schmidt, each step done twice, of the first k rows of b (k, 3): q (k, 3), r (3, 3) upper.
 
@@ -73,7 +73,7 @@ def orthonormal(b: Array, k: int, q: Array, r: Array, pivot: Index) -> int:
     return 3
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def gather(j: int, first: Offsets, weight: Array, by_ground: Array, y: Array, rays: Offsets, root: Array, b: Array, t: Array) -> int:
     """Collect the accepted rays of point j: their rows, square roots of weights, stacked B and y. Returns their number."""
     n = 0
@@ -88,7 +88,7 @@ def gather(j: int, first: Offsets, weight: Array, by_ground: Array, y: Array, ra
     return n
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def most_rays(first: Offsets) -> int:
     """Largest number of rays of a point, at least one."""
     most = 1
@@ -97,7 +97,7 @@ def most_rays(first: Offsets) -> int:
     return most
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def by_images(first: Offsets, image: Index, weight: Array) -> Offsets:
     """The points (n,) in an order in which those with accepted rays in the same images come together, where the first of them stood.
 
@@ -133,7 +133,7 @@ def by_images(first: Offsets, image: Index, weight: Array) -> Offsets:
     return order
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def same_images(n: int, rays: Offsets, image: Index, count: int, seen: Index) -> bool:
     """True when a point's n rays are in the images ``seen`` (count), in this order."""
     same = n == count
@@ -142,7 +142,7 @@ def same_images(n: int, rays: Offsets, image: Index, count: int, seen: Index) ->
     return same
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def complement(q: Array, rank: int, k: int, basis: Array) -> int:
     """Orthonormal basis (k, k - rank) of all that q (k, rank) does not span, Gram-Schmidt done twice. Returns the number of its columns."""
     for m in range(k - rank):
@@ -173,7 +173,7 @@ def complement(q: Array, rank: int, k: int, basis: Array) -> int:
     return k - rank
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def remove_ground(q: Array, rank: int, k: int, t: Array) -> None:
     """Project the first k numbers of t onto what the point cannot explain, ``(I - QQ')t``, in place."""
     for e in range(rank):

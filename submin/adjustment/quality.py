@@ -33,7 +33,7 @@ BAND = 0.95
 """Chance with which the variance factor of a right model falls into its band."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _redundancy_numbers(first: Offsets, image: Index, weight: Array, by_ground: Array, by_parameters: Array, covariance: Array) -> Array:
     """Redundancy numbers (r, 2) of accepted rays; NaN for the others."""
     most = most_rays(first)

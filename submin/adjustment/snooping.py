@@ -31,7 +31,7 @@ TIE = 1e-9
 """Drops that differ by this part are the same but for round-off."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _leave_out(variance: Array, residual: Array, rays: Offsets, size: int, n: int, testable: Array) -> tuple[float, float]:
     """Leave rays ``rays[:size]`` out of the n that have these residuals (2 n) of this covariance (2 n, 2 n); both are changed.
 
@@ -66,7 +66,7 @@ def _leave_out(variance: Array, residual: Array, rays: Offsets, size: int, n: in
     return drop, worst
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _choices(n: int, k: int) -> int:
     number = 1
     for i in range(k):
@@ -74,7 +74,7 @@ def _choices(n: int, k: int) -> int:
     return number
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def explain(variance: Array, residual: Array, n: int, critical: float, doubt: float, testable: Array, blunder: NDArray[np.bool_]) -> None:
     """Mark in ``blunder`` (n) the rays of a point that fails its test that go.
 
@@ -115,7 +115,7 @@ def explain(variance: Array, residual: Array, n: int, critical: float, doubt: fl
     blunder[:n] = True
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def image_part(
     n: int, rays: Offsets, root: Array, n2: int, rays2: Offsets, root2: Array, image: Index, by_parameters: Array, covariance: Array,
     mirrored: bool, out: Array,
@@ -145,7 +145,7 @@ def image_part(
                 out[k, i] = out[i, k]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _turned(basis: Array, free: int, n: int, full: Array, basis2: Array, free2: int, n2: int, product: Array, out: Array) -> None:
     """``N' X N2`` (free, free2) of a matrix X (2 n, 2 n2)."""
     for e in range(free):
@@ -163,7 +163,7 @@ def _turned(basis: Array, free: int, n: int, full: Array, basis2: Array, free2: 
                 out[e, d] += part * basis2[k, d]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def residual_space(
     n: int, rays: Offsets, root: Array, image: Index, by_parameters: Array, q: Array, rank: int, covariance: Array,
     basis: Array, known: Array, product: Array, inner: Array,
@@ -182,7 +182,7 @@ def residual_space(
     return free
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def residual_variances(q: Array, rank: int, k: int, known: Array, product: Array, variance: Array) -> None:
     """Diagonal (k) of ``V = P - P X P``, ``P = I - QQ'``, of X = ``known`` (k, k), without a basis of what P leaves."""
     for i in range(k):
@@ -205,7 +205,7 @@ def residual_variances(q: Array, rank: int, k: int, known: Array, product: Array
                 variance[i] -= q[i, e] * total * q[i, d]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def residual_covariance(basis: Array, inner: Array, free: int, i: int, k: int) -> float:
     """Element (i, k) of ``N inner N'``."""
     total = 0.0
@@ -217,7 +217,7 @@ def residual_covariance(basis: Array, inner: Array, free: int, i: int, k: int) -
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _misclosures(n: int, rays: Offsets, root: Array, image: Index, by_parameters: Array, theta: Array, t: Array) -> None:
     """Take what the images' corrections explain out of the stacked observations ``t`` (2 n) of a point, in place."""
     for a in range(n):
@@ -227,7 +227,7 @@ def _misclosures(n: int, rays: Offsets, root: Array, image: Index, by_parameters
                 t[2 * a + c] -= root[a] * by_parameters[i, c, u] * theta[image[i], u]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _predicted(inner: Array, e: Array, cross: Array, inner2: Array, e2: Array, free: int, free2: int) -> None:
     """Turn what a set of rays says into what it would, were the images adjusted with these rays of the point and no others of it.
 
@@ -262,7 +262,7 @@ def _predicted(inner: Array, e: Array, cross: Array, inner2: Array, e2: Array, f
             inner[i, k] = inverse[i, k]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _along(basis: Array, free: int, k: int, t: Array, e: Array) -> None:
     """``e = N't`` (free) of stacked numbers (k)."""
     for m in range(free):
@@ -271,7 +271,7 @@ def _along(basis: Array, free: int, k: int, t: Array, e: Array) -> None:
             e[m] += basis[i, m] * t[i]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _tested(n: int, rays: Offsets, residual: Array, variance: Array, testable: Array, statistic: Array) -> float:
     """Largest w of a point's n rays, of their residuals (2 n) and variances (2 n); those of the rays become their ``statistic``."""
     worst = 0.0
@@ -284,7 +284,7 @@ def _tested(n: int, rays: Offsets, residual: Array, variance: Array, testable: A
     return worst
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def snoop(
     first: Offsets, image: Index, weight: Array, used: Array, by_ground: Array, by_parameters: Array, y: Array,
     theta: Array, covariance: Array, critical: float, doubt: float, testable: Array, statistic: Array,

@@ -21,7 +21,7 @@ DENSE_PART = 0.05
 """So is a factor of which a larger part than this is not zero."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mirror(matrix: Array, block: int) -> None:
     size = len(matrix)
     for top in range(0, size, block):
@@ -41,7 +41,7 @@ def fill_symmetric(lower: Array) -> Array:
     return lower
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _permuted(lower: Array, order: Rows, p: int, out: Array) -> None:
     for a in range(len(order)):
         for b in range(a + 1):
@@ -63,7 +63,7 @@ def permuted(lower: Array, order: NDArray[np.integer], parameters: int) -> Array
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_into(total: Array, lower: Array, at: Rows, p: int, weight: float) -> None:
     for a in range(len(at)):
         for u in range(p):
@@ -82,7 +82,7 @@ def add_into(total: Array, lower: Array, at: NDArray[np.integer], parameters: in
     _add_into(total, lower, np.asarray(at, dtype=np.int64), parameters, weight)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _between(first: Rows, column: NDArray[np.int32], value: Array, full: Array, out: Array) -> None:
     row = np.empty(len(full))
     for i in range(len(first) - 1):
@@ -113,7 +113,7 @@ def between(factor: sp.csr_array, full: Array, *, transposed: bool = False) -> A
     return fill_symmetric(out)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _pack(lower: Array, out: Array) -> None:
     k = 0
     for i in range(len(lower)):
@@ -129,7 +129,7 @@ def packed(lower: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _unpack(values: Array, out: Array) -> None:
     k = 0
     for i in range(len(out)):
@@ -146,7 +146,7 @@ def unpacked(values: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_packed(total: Array, values: Array, at: Rows) -> None:
     k = 0
     for i in range(len(at)):
@@ -163,7 +163,7 @@ def add_packed(total: Array, values: Array, at: NDArray[np.integer]) -> None:
     _add_packed(total, values, np.asarray(at, dtype=np.int64))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _take(values: Array, at: Rows, out: Array) -> None:
     for i in range(len(at)):
         for j in range(i + 1):

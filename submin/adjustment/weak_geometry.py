@@ -19,7 +19,7 @@ UNDETERMINED_DEGREES = 0.02
 """Rays that meet at less place it three thousand times worse, kilometres for pixels of a metre: reported as not determined."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _largest_angles(first: Offsets, weight: Array, by_ground: Array) -> Array:
     """Largest angle (n,), radians, between two accepted rays of each point."""
     angles = np.full(len(first) - 1, np.nan)

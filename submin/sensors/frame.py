@@ -50,7 +50,7 @@ NEWTON_MM = 1e-8
 """A Newton step this small was the last one: what it leaves is its square."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _turn(axis: Array, angle: float, out: Array) -> None:
     """Rotation matrix by an angle about a unit vector."""
     c, s = np.cos(angle), np.sin(angle)
@@ -66,14 +66,14 @@ def _turn(axis: Array, angle: float, out: Array) -> None:
     out[2, 1] += s * axis[0]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _product(one: Array, other: Array, out: Array) -> None:
     for a in range(3):
         for b in range(3):
             out[a, b] = one[a, 0] * other[0, b] + one[a, 1] * other[1, b] + one[a, 2] * other[2, b]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _rate(axis: Array, matrix: Array, out: Array) -> None:
     """Derivative of ``R(axis, -w) matrix`` by w where it is ``matrix``: ``-axis x`` each column."""
     for b in range(3):
@@ -82,7 +82,7 @@ def _rate(axis: Array, matrix: Array, out: Array) -> None:
         out[2, b] = axis[1] * matrix[0, b] - axis[0] * matrix[1, b]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _attitudes(cameras: Array, parameters: Array) -> Array:
     """Matrices (m, 4, 3, 3) that give u from d, and its derivatives by alpha, beta and kappa."""
     out = np.empty((len(cameras), 4, 3, 3))
@@ -110,7 +110,7 @@ def _attitudes(cameras: Array, parameters: Array) -> Array:
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bend(camera: Array, x: float, y: float, out: Array) -> None:
     """The distortion polynomial at (x, y), mm: g and its partials, ``out`` = gx, gy, dgx/dx, dgx/dy, dgy/dx, dgy/dy."""
     k1, k2, k3 = camera[_RADIAL], camera[_RADIAL + 1], camera[_RADIAL + 2]
@@ -126,7 +126,7 @@ def _bend(camera: Array, x: float, y: float, out: Array) -> None:
         out[3 + 2 * c] = along * y + (radial if c == 1 else 0.0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _unbend(camera: Array, x: float, y: float, out: Array) -> None:
     """Where the polynomial is (x, y): as `_bend`, of the inverse; NaN where there is no such place within reach."""
     gx, gy = x, y
@@ -150,7 +150,7 @@ def _unbend(camera: Array, x: float, y: float, out: Array) -> None:
     out[2], out[3], out[4], out[5] = yy / determinant, -xy / determinant, -yx / determinant, xx / determinant
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _through_lens(camera: Array, x: float, y: float, to_measured: bool, out: Array) -> None:
     """Ideal to measured coordinates (mm, from the principal point), or back, with partials; NaN out of reach. ``out`` as of `_bend`."""
     if (camera[_TO_MEASURED] > 0.0) == to_measured:
@@ -162,7 +162,7 @@ def _through_lens(camera: Array, x: float, y: float, to_measured: bool, out: Arr
         _unbend(camera, x, y, out)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _project(cameras: Array, parameters: Array, geocentric: Array, image: Index, point: Index) -> tuple[Array, Array, Array]:
     rays = len(image)
     predicted, by_ground, by_parameters = np.empty((rays, 2)), np.empty((rays, 2, 3)), np.empty((rays, 2, 7))
@@ -207,7 +207,7 @@ def _project(cameras: Array, parameters: Array, geocentric: Array, image: Index,
     return predicted, by_ground, by_parameters
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _directions(cameras: Array, image: Index, samples: Array, lines: Array) -> Array:
     """Directions (r, 3) in body-fixed axes, unit vectors, into which unadjusted cameras look at image coordinates; NaN out of reach."""
     out, lens = np.empty((len(image), 3)), np.empty(6)

@@ -44,7 +44,7 @@ _SEEN, _SEEN_BY_TIME, _CORRECTED, _LENGTHS, _BY_SEEN, _BY_SIGHT, _RATES, _AXES =
 _WORK = 21
 """Rows of three numbers in which one ray is worked out; ``_AXES`` are three."""
 
-_compiled = numba.njit(cache=True, error_model="numpy")
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_compiled

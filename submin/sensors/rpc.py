@@ -46,7 +46,7 @@ LOCALISED_PIXELS = 1e-6
 """Far below any measurement, and far above the spacing of longitudes in float64 (a few 1e-9 pixels)."""
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _raw(camera: Array, geodetic: Array, terms: Array, sums: Array, sample: Array, line: Array) -> None:
     """Unadjusted sample and line and their partials by longitude, latitude (per degree) and height (per metre): two rows of 4.
 
@@ -81,7 +81,7 @@ def _raw(camera: Array, geodetic: Array, terms: Array, sums: Array, sample: Arra
         out[3] = (sums[3, k] - ratio * sums[3, k + 1]) * part / camera[_H_SC]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _terms(lon: float, lat: float, h: float, t: Array) -> None:
     """Terms of a cubic polynomial in RPC00B order, and their partials by longitude, latitude and height (4, 20); zeros stay zero."""
     ll, pp, hh = lon * lon, lat * lat, h * h
@@ -97,7 +97,7 @@ def _terms(lon: float, lat: float, h: float, t: Array) -> None:
     t[3, 13], t[3, 16], t[3, 17], t[3, 18], t[3, 19] = 2.0 * lon * h, 2.0 * lat * h, ll, pp, 3.0 * hh
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _project(
     cameras: Array, parameters: Array, geodetic: Array, jacobian: Array, image: Index, point: Index, at: Array
 ) -> tuple[Array, Array, Array]:
@@ -129,7 +129,7 @@ def _project(
     return predicted, by_ground, by_parameters
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _localise(cameras: Array, image: Index, samples: Array, lines: Array, heights: Array) -> Array:
     ground = np.empty((len(image), 3))
     sample, line, terms, sums = np.empty(4), np.empty(4), np.zeros((4, TERMS)), np.empty((4, 4))
