@@ -81,12 +81,12 @@ class Difference:
     @classmethod
     def of(cls, found: Outcome, wanted: Outcome) -> Difference:
         """Of one contender's results from another's, of the points of which the first has a covariance."""
-        near, far = (_relative(getattr(found, name), getattr(wanted, name)) for name in ("near", "far"))
-        single = _relative(found.covariance, wanted.covariance[np.searchsorted(wanted.rows, found.rows)])
+        near, far = (relative_difference(getattr(found, name), getattr(wanted, name)) for name in ("near", "far"))
+        single = relative_difference(found.covariance, wanted.covariance[np.searchsorted(wanted.rows, found.rows)])
         return cls(float(np.abs(found.coordinates - wanted.coordinates).max()), single, max(near, far))
 
 
-def _relative(found: Array, wanted: Array) -> float:
+def relative_difference(found: Array, wanted: Array) -> float:
     """Largest difference of covariances (..., k, k) over the sigmas of row and column."""
     sigma = np.sqrt(np.diagonal(wanted, axis1=-2, axis2=-1))
     return float((np.abs(found - wanted) / (sigma[..., :, None] * sigma[..., None, :])).max())

@@ -178,18 +178,30 @@ def problem_of(network: Network, last_block: frozenset[str]) -> Problem:
     starts = np.cumsum(count) - count
     ray = np.concatenate([np.arange(starts[j], starts[j] + count[j]) for j in order])
     at, names = np.concatenate(origin)[order], snapshot.image_columns(["image_id"])["image_id"]
-    near, far = _asked(at)
+    middle = int(np.argmin(np.linalg.norm(at - at.mean(axis=0), axis=1)))
     return Problem(
         whole[order], at, np.concatenate([[0], np.cumsum(count[order])]), np.concatenate(image)[ray].astype(np.int64),
         np.concatenate(by_ground)[ray], np.concatenate(by_parameters)[ray], np.concatenate(y)[ray], prior,
-        columns.image * snapshot.metadata.parameters + columns.parameter, np.isin(names, list(last_block)), near, far,
+        columns.image * snapshot.metadata.parameters + columns.parameter, np.isin(names, list(last_block)),
+        _nearest(at, middle), _drawn(len(at), np.random.default_rng(0)),
     )  # fmt: skip
 
 
 
 
-def _asked(at: Array) -> tuple[Rows, Rows]:
-    """Points around the one nearest to the middle, and points drawn from all of them, ascending."""
-    middle = np.argmin(np.linalg.norm(at - at.mean(axis=0), axis=1))
-    near = np.sort(np.argsort(np.linalg.norm(at - at[middle], axis=1))[:ASKED])
-    return near, np.sort(np.random.default_rng(0).choice(len(at), min(ASKED, len(at)), replace=False))
+def around(problem: Problem, rng: np.random.Generator) -> Rows:
+    """The points around one that is drawn, ascending."""
+    return _nearest(problem.origin, int(rng.integers(len(problem))))
+
+
+def spread(problem: Problem, rng: np.random.Generator) -> Rows:
+    """Points drawn from all, ascending."""
+    return _drawn(len(problem), rng)
+
+
+def _nearest(at: Array, centre: int) -> Rows:
+    return np.sort(np.argsort(np.linalg.norm(at - at[centre], axis=1))[:ASKED])
+
+
+def _drawn(points: int, rng: np.random.Generator) -> Rows:
+    return np.sort(rng.choice(points, min(ASKED, points), replace=False))
