@@ -63,7 +63,7 @@ def command(
     seed: Annotated[int | None, typer.Option(help="faults: seed of the moments; default: drawn, and said.")] = None,
     network: Annotated[Path | None, typer.Option(help="query: a network that is there already, in place of a new one.")] = None,
     figures: Annotated[
-        Path | None, typer.Option("--out", help="five-blocks, worldview, correlation, continuity: folder for figures; peers: for peers.json.")
+        Path | None, typer.Option("--out", help="five-blocks, worldview, correlation, continuity: folder for figures; peers: for its rows.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:

@@ -133,12 +133,13 @@ def _peer(module: str, folder: Path) -> None:
 def _claims(rung: Rung, points: int, ours: Outcome, besides: Besides) -> list[dict[str, Any]]:
     """What is asked of ours: agreement on every rung, times on the largest."""
     size, times = f"{points:,} points ({rung.name}): ours", ours.times
+    slower, slower_anew = max(times.joint_near, times.joint_far), max(besides.anew_near, besides.anew_far)
     of_system = f"{size} and its own system solved once in {besides.seconds:.2g} s"
     timed = [
         (f"{size}, all 3x3 covariances once reconciled, s", SINGLES_SECONDS, times.all_3x3),
         (f"{size}, the same, network opened anew", SINGLES_SECONDS, besides.anew_3x3),
-        (f"{size}, joint covariance of 100 points once reconciled, the slower of near and far, s", JOINT_SECONDS, max(times.joint_near, times.joint_far)),
-        (f"{size}, the same, network opened anew", JOINT_SECONDS, max(besides.anew_near, besides.anew_far)),
+        (f"{size}, joint covariance of 100 points once reconciled, the slower of near and far, s", JOINT_SECONDS, slower),
+        (f"{size}, the same, network opened anew", JOINT_SECONDS, slower_anew),
     ]
     full = rung is LADDER[-1]
     return [
@@ -169,7 +170,8 @@ def _faster(found: Outcome, ours: Outcome) -> list[str]:
 
 
 def _versions() -> list[dict[str, Any]]:
-    return [{"peer": peer, "package": package, "version": version(package)} for peer, (package, _) in PEERS.items() if importlib.util.find_spec(package)]
+    there = {peer: package for peer, (package, _) in PEERS.items() if importlib.util.find_spec(package)}
+    return [{"peer": peer, "package": package, "version": version(package)} for peer, package in there.items()]
 
 
 def _in_its_own_process(work: Callable[..., T], *arguments: object) -> T:

@@ -1,8 +1,9 @@
-"""A peer: GTSAM, which is given the linear system as a factor graph: one variable a point, one a group of images, one for what passes share.
+"""A peer: GTSAM, given the linear system as a factor graph: one variable a point, one a group of images, one for what passes share.
 
-It has no RPC cameras, and no need of them: the rays are linear factors. Points are eliminated first, in the order that GTSAM's COLAMD finds
-(METIS is slower here), by multifrontal Cholesky. Of what it offers for one more block the faster is taken: `GaussianISAM.update`, or the whole
-again. Building the graph goes through its Python interface, factor by factor; that time stands by itself.
+It has no RPC cameras, and no need of them: rays are linear factors of a point and a group of images. Everything is left to it as it comes:
+multifrontal Cholesky in the order that its COLAMD finds. Of what it offers for one more block the faster counts: `GaussianISAM.update`, or
+the whole again. The graph is built through its Python interface, factor by factor; that time stands by itself, and for one more block is
+left out.
 """
 
 from __future__ import annotations

@@ -37,13 +37,13 @@ SAMPLED = 1000
 def write_catalogues(blocks: Sequence[Block], folder: Path) -> None:
     """All blocks, all but the last, and the last, each as a catalogue."""
     for name, some in (("all", blocks), ("others", blocks[:-1]), ("last", blocks[-1:])):
-        priors = [block.a_priori for block in some]
+        priors = [block.a_priori for block in some if block.a_priori is not None]
         most = max(priors, key=priors.count)
         with CatalogueWriter(folder / name, CatalogueMetadata(name=f"blocks of a benchmark: {name}")) as writer:
             writer.write_images(chain.from_iterable(block.images for block in some))
             for block in some:
                 writer.write_block(block)
-            writer.write_priors(most, {block.block_id: block.a_priori for block in some if block.a_priori != most})
+            writer.write_priors(most, {b.block_id: b.a_priori for b in some if b.a_priori not in (None, most)})
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,14 @@
 """The linear system of a network as arrays that any solver can be given: rays, a priori model and points, with what is asked of them.
 
-A ray says ``y = A theta + B (x - x0) + v``, ``Cov v = I``; an image's adjustable parameters are ``theta = K u``, ``u ~ N(0, I)``. That is what
-the product itself has linearised: peers need know nothing of cameras, and all solve the same.
+A ray says ``y = A theta + B (x - x0) + v``, ``Cov v = I``; an image's adjustable parameters are ``theta = K u``, ``u ~ N(0, I)``. That is
+what the product itself has linearised: peers need know nothing of cameras, and all solve the same.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +117,7 @@ class ImageGroups:
         images, p = len(problem.added), problem.by_parameters.shape[2]
         edges = np.searchsorted(problem.adjusted, np.arange(images + 1) * p)
         of_images, rows = np.full(images, -1), []
-        for image, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        for image, (low, high) in enumerate(pairwise(edges)):
             rows.append((problem.adjusted[low:high] % p, self.place[low:high]))
             if high > low:
                 of_images[image] = self.of_row[low]
@@ -185,8 +186,6 @@ def problem_of(network: Network, last_block: frozenset[str]) -> Problem:
         columns.image * snapshot.metadata.parameters + columns.parameter, np.isin(names, list(last_block)),
         _nearest(at, middle), _drawn(len(at), np.random.default_rng(0)),
     )  # fmt: skip
-
-
 
 
 def around(problem: Problem, rng: np.random.Generator) -> Rows:

@@ -1,9 +1,9 @@
-"""A network's own linear system, that of all its cells, solved once by a sparse direct solver: what tiles and their reconciliation must give.
+"""A network's own linear system, that of all its cells, solved once by a sparse direct solver: what a reconciliation must give.
 
     Lambda = I + K' S K        Lambda u = K' h        theta = K u        P_ij = delta_ij D_j + U_i K Lambda^-1 K' U_j'
 
 S and h are the sums of all cells, K the a priori factor of all images; no tile, no tree and no stored state of either is looked at. The
-solver is CHOLMOD (of cvxopt's wheel), or SuperLU (of SciPy) where that is not installed; CHOLMOD needs a third of its memory.
+solver is CHOLMOD (of cvxopt's wheel), or SuperLU (of SciPy) where that is not installed.
 
 Memory: cells are read a few at a time and added to the blocks of S that any point joins, so it is that of S and of the factor of Lambda.
 """
@@ -188,15 +188,12 @@ def _symmetric(keys: Rows, blocks: Array, images: int) -> sp.csc_array:
 
 
 def _cholmod(matrix: sp.csc_array) -> Solve:
-    from cvxopt import cholmod
+    from cvxopt import cholmod, spmatrix
     from cvxopt import matrix as dense
-    from cvxopt import spmatrix
 
     cholmod.options["supernodal"] = 2  # the factor of LL', in dense panels
     lower = sp.tril(matrix, format="coo")
-    packed = spmatrix(
-        dense(lower.data), dense(lower.row.astype(np.int64)), dense(lower.col.astype(np.int64)), lower.shape
-    )  # fmt: skip
+    packed = spmatrix(dense(lower.data), dense(lower.row.astype(np.int64)), dense(lower.col.astype(np.int64)), lower.shape)
     factor = cholmod.symbolic(packed)
     cholmod.numeric(packed, factor)
 
