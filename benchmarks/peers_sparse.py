@@ -50,14 +50,15 @@ def adjust(problem: Problem) -> Outcome:
     before = problem.before_last_block()
     known = eliminated(problem, before)
     clock = time.perf_counter()
-    solved(problem, added(problem, known, before))
+    sums = added(problem, known, before)
+    coordinates_of(problem, sums, solved(problem, sums))
     one_block = time.perf_counter() - clock
 
     clock = time.perf_counter()
     sums = eliminated(problem, every)
     built, clock = time.perf_counter() - clock, time.perf_counter()
     solution = solved(problem, sums)
-    coordinates = problem.origin + sums.offset + _by_point(problem, np.einsum("rcp,rp->rc", sums.loading, solution.theta[problem.image]))
+    coordinates = coordinates_of(problem, sums, solution)
     solve, clock = time.perf_counter() - clock, time.perf_counter()
     covariance = all_covariances(problem, sums, solution)
     all_3x3, clock = time.perf_counter() - clock, time.perf_counter()
@@ -121,11 +122,17 @@ def added(problem: Problem, known: Eliminated, before: Mask) -> Eliminated:
     )  # fmt: skip
 
 
+def coordinates_of(problem: Problem, sums: Eliminated, solution: SparseAdjustment) -> Array:
+    """Geocentric coordinates (n, 3) of all points."""
+    by_ray = np.einsum("rcp,rp->rc", sums.loading, solution.theta[problem.image])
+    return np.asarray(problem.origin + sums.offset + np.add.reduceat(by_ray, problem.first[:-1], axis=0))
+
+
 def all_covariances(problem: Problem, sums: Eliminated, solution: SparseAdjustment) -> Array:
     """Covariances (n, 3, 3) of all points, by M of all images."""
     prior = solution.prior
-    half = prior @ solution.solve(np.asfortranarray(prior.T.toarray()))
-    return point_covariances(problem.first, problem.image.astype(np.int32), _factors(sums.own, sums.loading), np.ascontiguousarray(half))
+    of_images = np.ascontiguousarray(prior @ solution.factor.solve(prior.T.toarray()))
+    return point_covariances(problem.first, problem.image.astype(np.int32), _factors(sums.own, sums.loading), of_images)
 
 
 def joint(problem: Problem, sums: Eliminated, solution: SparseAdjustment, points: Rows) -> Array:
@@ -135,14 +142,9 @@ def joint(problem: Problem, sums: Eliminated, solution: SparseAdjustment, points
     rows = 3 * np.searchsorted(points, problem.point[rays])[:, None, None] + np.arange(3)[:, None] + np.zeros(p, dtype=np.int64)
     columns = (problem.image[rays] * p)[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(p)
     of_points = sp.csr_array((sums.loading[rays].ravel(), (rows.ravel(), columns.ravel())), shape=(3 * k, problem.prior.shape[0]))
-    loading = of_points @ solution.prior
-    found = np.asarray(loading @ solution.solve(np.asfortranarray(loading.T.toarray())))
+    found = solution.factor.quadratic((of_points @ solution.prior).T.tocsc())
     found.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k), :] += sums.own[points]
     return found
-
-
-def _by_point(problem: Problem, of_ray: Array) -> Array:
-    return np.asarray(np.add.reduceat(of_ray, problem.first[:-1], axis=0))
 
 
 def _factors(own: Array, loading: Array) -> PointFactors:

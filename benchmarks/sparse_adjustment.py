@@ -13,6 +13,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -28,11 +29,26 @@ from submin.storage.network_store import Snapshot
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
-Solve = Callable[[Array], Array]
 
 CELLS_AT_ONCE = 16
 POINTS_AT_ONCE = 32
-"""Right-hand sides of so many points are solved together: 120 MB each for all of China."""
+"""Covariances of so many points are found together: SuperLU's right-hand sides are 120 MB then for all of China."""
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """A positive definite matrix Lambda (q, q), factored.
+
+    Attributes
+    ----------
+    solver : name
+    solve : right-hand sides (q, k) to ``Lambda^-1`` times them
+    quadratic : V' (q, k), sparse, to ``V Lambda^-1 V'`` (k, k)
+    """
+
+    solver: str
+    solve: Callable[[Array], Array]
+    quadratic: Callable[[sp.csc_array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +77,12 @@ class SparseAdjustment:
     ----------
     theta : (m, p) corrections of all images
     prior : K (m p, q)
-    solve : right-hand sides (q, k) to ``Lambda^-1`` times them
-    solver : name
+    factor : of Lambda
     """
 
     theta: Array
     prior: sp.csr_array
-    solve: Solve
-    solver: str
+    factor: Factor
 
     @classmethod
     def of(cls, snapshot: Snapshot, solver: str | None = None) -> SparseAdjustment:
@@ -78,9 +92,9 @@ class SparseAdjustment:
     @classmethod
     def of_system(cls, system: SparseSystem, solver: str | None = None) -> SparseAdjustment:
         """Solve a system that is there already."""
-        solve, name = factorised(reduced(system), solver)
-        theta = system.prior @ solve((system.prior.T @ system.vector)[:, None])[:, 0]
-        return cls(theta.reshape(-1, system.parameters), system.prior, solve, name)
+        factor = factorised(reduced(system), solver)
+        theta = system.prior @ factor.solve((system.prior.T @ system.vector)[:, None])[:, 0]
+        return cls(theta.reshape(-1, system.parameters), system.prior, factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +133,8 @@ def reduced(system: SparseSystem) -> sp.csc_array:
     return sp.csc_array(half + sp.eye_array(half.shape[0], format="csc"))
 
 
-def factorised(matrix: sp.csc_array, solver: str | None = None) -> tuple[Solve, str]:
-    """What solves with a positive definite matrix (both triangles), and the name of the solver.
+def factorised(matrix: sp.csc_array, solver: str | None = None) -> Factor:
+    """Factor a positive definite matrix of which both triangles are given.
 
     Raises
     ------
@@ -128,7 +142,7 @@ def factorised(matrix: sp.csc_array, solver: str | None = None) -> tuple[Solve, 
         When the matrix is not positive definite (CHOLMOD), or singular (SuperLU).
     """
     name = solver or ("cholmod" if importlib.util.find_spec("cvxopt") else "superlu")
-    return (_cholmod(matrix) if name == "cholmod" else _superlu(matrix)), name
+    return _cholmod(matrix) if name == "cholmod" else _superlu(matrix)
 
 
 def adjusted_points(network: Network, solution: SparseAdjustment, selections: Sequence[Selection]) -> AdjustedPoints:
@@ -140,20 +154,18 @@ def adjusted_points(network: Network, solution: SparseAdjustment, selections: Se
     base = np.concatenate([part.origin + part.factors.offset for part in parts])
     order = np.argsort(ids)
     at = base + (loading @ solution.theta.ravel()).reshape(-1, 3)
-    covariance = covariances(sp.csr_array(loading @ solution.prior), own, solution.solve)
+    covariance = covariances(sp.csr_array(loading @ solution.prior), own, solution.factor)
     return AdjustedPoints(ids[order], at[order], covariance[order])
 
 
-def covariances(loading: sp.csr_array, own: Array, solve: Solve) -> Array:
+def covariances(loading: sp.csr_array, own: Array, factor: Factor) -> Array:
     """``D + V Lambda^-1 V'`` (n, 3, 3) of points by themselves; V (3n, q) their loadings on the whitened vectors."""
     found = own.copy()
     for start in range(0, len(own), POINTS_AT_ONCE):
         stop = min(start + POINTS_AT_ONCE, len(own))
-        some = loading[3 * start : 3 * stop]
-        right = (some @ solve(np.asfortranarray(some.T.toarray()))).reshape(stop - start, 3, stop - start, 3)
+        joint = factor.quadratic(loading[3 * start : 3 * stop].T.tocsc()).reshape(stop - start, 3, stop - start, 3)
         diagonal = np.arange(stop - start)
-        of_point = right[diagonal, :, diagonal, :]
-        found[start:stop] += 0.5 * (of_point + of_point.transpose(0, 2, 1))
+        found[start:stop] += joint[diagonal, :, diagonal, :]
     return found
 
 
@@ -187,25 +199,42 @@ def _symmetric(keys: Rows, blocks: Array, images: int) -> sp.csc_array:
     return sp.csc_array((rows + rows.T.tocsr() - diagonal).T)
 
 
-def _cholmod(matrix: sp.csc_array) -> Solve:
+def _cholmod(matrix: sp.csc_array) -> Factor:
     from cvxopt import cholmod, spmatrix
     from cvxopt import matrix as dense
 
     cholmod.options["supernodal"] = 2  # the factor of LL', in dense panels
-    lower = sp.tril(matrix, format="coo")
-    packed = spmatrix(dense(lower.data), dense(lower.row.astype(np.int64)), dense(lower.col.astype(np.int64)), lower.shape)
-    factor = cholmod.symbolic(packed)
-    cholmod.numeric(packed, factor)
+    order, lower = 7, 4  # CHOLMOD's numbers for P b and for L^-1 b
+
+    def packed(entries: sp.coo_array) -> Any:
+        rows, columns = (dense(places.astype(np.int64)) for places in (entries.row, entries.col))
+        return spmatrix(dense(np.ascontiguousarray(entries.data)), rows, columns, entries.shape)
+
+    whole = packed(sp.tril(matrix, format="coo"))
+    factor = cholmod.symbolic(whole)
+    cholmod.numeric(whole, factor)
 
     def solve(right: Array) -> Array:
         found = dense(np.asfortranarray(right, dtype=np.float64))
         cholmod.solve(factor, found)
         return np.array(found)
 
-    return solve
+    def quadratic(right: sp.csc_array) -> Array:
+        # V Lambda^-1 V' = W'W, W = L^-1 P V': half of a solution, and W is sparse since L^-1 follows the tree of elimination
+        half = cholmod.spsolve(factor, cholmod.spsolve(factor, packed(right.tocoo()), sys=order), sys=lower)
+        first, row, value = (np.array(part).ravel() for part in half.CCS)
+        w = sp.csc_array((value, row, first), shape=half.size)
+        return np.asarray((w.T @ w).toarray())
+
+    return Factor("cholmod", solve, quadratic)
 
 
-def _superlu(matrix: sp.csc_array) -> Solve:
+def _superlu(matrix: sp.csc_array) -> Factor:
     # a symmetric ordering, pivots on the diagonal: for a positive definite matrix that is Cholesky's
     factor = spla.splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return lambda right: np.asarray(factor.solve(np.ascontiguousarray(right)))
+
+    def quadratic(right: sp.csc_array) -> Array:
+        found = np.asarray(right.T @ factor.solve(right.toarray()))
+        return np.asarray(0.5 * (found + found.T))
+
+    return Factor("superlu", lambda right: np.asarray(factor.solve(np.ascontiguousarray(right))), quadratic)

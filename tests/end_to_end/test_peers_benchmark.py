@@ -73,7 +73,7 @@ def test_own_system_solved_once_is_the_one_factorisation(
     for solver in ("superlu", *(["cholmod"] if "sparse (CHOLMOD)" in INSTALLED else [])):
         solution = SparseAdjustment.of(network.snapshot, solver)
         found = adjusted_points(network, solution, network.named(ids[chosen]))
-        assert solution.solver == solver
+        assert solution.factor.solver == solver
         assert found.ids.tolist() == ids[chosen].tolist()
         assert np.abs(found.geocentric - at[chosen]).max() < 1e-6
         np.testing.assert_allclose(found.covariance, single[chosen], rtol=0.0, atol=1e-8 * np.abs(single).max())
