@@ -16,11 +16,12 @@ import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
-from benchmarks.comparison import below, data
+from benchmarks.comparison import DATA, below, data
 from benchmarks.machine import machine
 from benchmarks.peers_ours import Besides, adjust, write_catalogues
 from benchmarks.peers_outcome import Difference, Outcome
@@ -84,7 +85,16 @@ def measure(scale: float, workers: int, out: Path | None = None) -> list[dict[st
     every = [*table, *claims, *_versions()]
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        text = json.dumps({"benchmark": "peers", "scale": scale, "machine": machine(), "rows": every}, indent=1)
+        host = machine() | {row["package"]: row["version"] for row in every if "package" in row}
+        record = {
+            "benchmark": "peers",
+            "date": date.today().isoformat(),
+            "scale": scale,
+            "workers": workers,
+            "machine": host,
+            "rows": every,
+        }
+        text = json.dumps(record, indent=1, ensure_ascii=False)
         (out / "peers.json").write_text(text + "\n", encoding="utf-8")
     return every
 
@@ -100,7 +110,8 @@ def _rung(rung: Rung, workers: int) -> tuple[list[dict[str, Any]], list[dict[str
         claims = _claims(rung, len(problem), ours, besides)
         for peer, (package, module) in PEERS.items():
             if importlib.util.find_spec(package) is None:
-                claims.append(data(f"{peer}, {len(problem):,} points", f"not compared: package {package} is not installed", float("nan")))
+                reason = f"not compared: package {package} is not installed"
+                claims.append({"claim": f"{len(problem):,} points: {peer}", "wanted": reason, "found": "", "verdict": DATA})
                 continue
             _in_its_own_process(_peer, module, folder)
             found = Outcome.load(folder / f"{module}.npz")
