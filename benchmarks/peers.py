@@ -154,8 +154,8 @@ def _claims(rung: Rung, points: int, ours: Outcome, besides: Besides) -> list[di
     ]
     full = rung is LADDER[-1]
     return [
-        below(f"{of_system}, coordinates of {besides.sampled:,} points, m", AGREE, besides.metres),
-        below(f"{of_system}, their 3x3 covariances, relative", AGREE, besides.covariance),
+        below(f"{of_system}, all coordinates, m", AGREE, besides.metres),
+        below(f"{of_system}, 3x3 covariances of {besides.sampled:,} points, relative", AGREE, besides.covariance),
         *(below(*claim) if full else data(claim[0], f"60,000 points: {claim[1]:g} or less", claim[2]) for claim in timed),
     ]
 

@@ -20,6 +20,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from submin.adjustment.elimination import ground_corrections
 from submin.adjustment.priors import prior_factor
 from submin.network.sub_min import GroundPart, loadings
 from submin.query.planner import Selection, determined_parts
@@ -29,6 +30,7 @@ from submin.storage.network_store import Snapshot
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
+Ids = NDArray[np.str_]
 
 CELLS_AT_ONCE = 16
 POINTS_AT_ONCE = 32
@@ -101,7 +103,7 @@ class SparseAdjustment:
 class AdjustedPoints:
     """Points (n,) by ascending id, geocentric coordinates (n, 3) in metres, and the covariance (n, 3, 3) of each by itself."""
 
-    ids: NDArray[np.str_]
+    ids: Ids
     geocentric: Array
     covariance: Array
 
@@ -145,17 +147,28 @@ def factorised(matrix: sp.csc_array, solver: str | None = None) -> Factor:
     return _cholmod(matrix) if name == "cholmod" else _superlu(matrix)
 
 
+def located(network: Network, solution: SparseAdjustment, selections: Sequence[Selection]) -> tuple[Ids, Array]:
+    """Ids, ascending, and geocentric coordinates (n, 3) of some points, such as those of a tile; undetermined ones are left out."""
+    ids, at, _, _ = _placed(network, solution, selections)
+    order = np.argsort(ids)
+    return ids[order], at[order]
+
+
 def adjusted_points(network: Network, solution: SparseAdjustment, selections: Sequence[Selection]) -> AdjustedPoints:
     """Coordinates and covariances of some points, such as ``network.named(ids)``; those that are not determined are left out."""
+    ids, at, own, parts = _placed(network, solution, selections)
+    loading = loadings(parts, np.arange(len(solution.theta), dtype=np.int32), solution.theta.shape[1])
+    covariance = covariances(sp.csr_array(loading @ solution.prior), own, solution.factor)
+    order = np.argsort(ids)
+    return AdjustedPoints(ids[order], at[order], covariance[order])
+
+
+def _placed(network: Network, solution: SparseAdjustment, selections: Sequence[Selection]) -> tuple[Ids, Array, Array, list[GroundPart]]:
+    """Ids, coordinates and own parts of some points, cell after cell, and the ground parts that they come from."""
     kept, parts = determined_parts(network, selections)
     ids = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
-    own = np.concatenate([part.factors.own for part in parts])
-    loading = _loading(parts, solution.theta)
-    base = np.concatenate([part.origin + part.factors.offset for part in parts])
-    order = np.argsort(ids)
-    at = base + (loading @ solution.theta.ravel()).reshape(-1, 3)
-    covariance = covariances(sp.csr_array(loading @ solution.prior), own, solution.factor)
-    return AdjustedPoints(ids[order], at[order], covariance[order])
+    at = np.concatenate([part.origin + ground_corrections(part.factors, part.linear, solution.theta) for part in parts])
+    return ids, at, np.concatenate([part.factors.own for part in parts]), parts
 
 
 def covariances(loading: sp.csr_array, own: Array, factor: Factor) -> Array:
@@ -167,10 +180,6 @@ def covariances(loading: sp.csr_array, own: Array, factor: Factor) -> Array:
         diagonal = np.arange(stop - start)
         found[start:stop] += joint[diagonal, :, diagonal, :]
     return found
-
-
-def _loading(parts: Sequence[GroundPart], theta: Array) -> sp.csr_array:
-    return loadings(parts, np.arange(len(theta), dtype=np.int32), theta.shape[1])
 
 
 def _batches(numbers: Sequence[int]) -> Iterator[Sequence[int]]:

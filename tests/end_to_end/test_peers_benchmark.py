@@ -16,10 +16,11 @@ from whole_network import truth
 import submin
 from benchmarks import peers, sparse_adjustment
 from benchmarks.comparison import DATA, MET
-from benchmarks.sparse_adjustment import SparseAdjustment, adjusted_points
+from benchmarks.sparse_adjustment import SparseAdjustment, adjusted_points, located
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import SerialExecutor
 from orchestration.run import run
+from submin.query.planner import all_points
 from submin.simulation.five_blocks import five_blocks
 from submin.simulation.region import simulate_region
 from submin.simulation.scene import realise
@@ -76,4 +77,7 @@ def test_own_system_solved_once_is_the_one_factorisation(
         assert solution.factor.solver == solver
         assert found.ids.tolist() == ids[chosen].tolist()
         assert np.abs(found.geocentric - at[chosen]).max() < 1e-6
+        every, places = located(network, solution, all_points(network))
+        assert every.tolist() == ids.tolist()
+        assert np.abs(places - at).max() < 1e-6
         np.testing.assert_allclose(found.covariance, single[chosen], rtol=0.0, atol=1e-8 * np.abs(single).max())
