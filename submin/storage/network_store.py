@@ -224,7 +224,9 @@ class Snapshot:
         else:
             session = repository.readonly_session(snapshot_id=find_version(place, version).snapshot)
         try:
-            return cls(zarr.open_group(session.store, mode="r"), place, parameters=parameters)
+            # what Zarr would look for beside, an older format and metadata of all members in one place, is never there
+            root = zarr.open_group(session.store, mode="r", zarr_format=3, use_consolidated=False)
+            return cls(root, place, parameters=parameters)
         except FileNotFoundError:
             raise StoreError(f"{place}: holds a repository but no network; make one with 'submin create'") from None
 
@@ -301,7 +303,7 @@ class Snapshot:
     def plain_images(self, rows: Sequence[int] | NDArray[np.integer]) -> list[NetworkImage]:
         """Images of these rows (ascending), views of correlated control without their rows of the common factor (`with_joint`)."""
         table = group_of(self.root, "images")
-        wanted = [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")]
+        wanted = [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence", "withdrawn")]
         if not len(rows):
             return []
         wanted_rows = np.asarray(rows, dtype=np.int64)
