@@ -60,7 +60,7 @@ BRANCH = "main"
 _FIRST_FORMAT: dict[str, Any] = {"spec_version": 1} if "spec_version" in signature(icechunk.Repository.create).parameters else {}
 """Icechunk 2 (which needs Python 3.12) reads and writes both formats, Icechunk 1 only the first: networks must travel."""
 _TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
-READ_OVER_ROWS = 256
+READ_OVER_ROWS = 32
 _ABSENT = "no such network; make one with 'submin create'"
 _TAKEN = "already exists; choose another place, or remove it first"
 
@@ -308,7 +308,7 @@ class Snapshot:
             return []
         wanted_rows = np.asarray(rows, dtype=np.int64)
         found: list[NetworkImage] = []
-        # a run of neighbours is one read of each column; a long gap between them is not read
+        # rows of a long gap between neighbours are not decoded; runs that lie in one chunk are read together
         runs = np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1)
         for run, columns in zip(runs, read_spans(table, wanted, [(int(run[0]), int(run[-1]) + 1) for run in runs]), strict=True):
             found.extend(network_images({name: values[run - run[0]] for name, values in columns.items()}))
