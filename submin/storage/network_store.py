@@ -59,6 +59,12 @@ icechunk.set_logs_filter("icechunk=error")
 BRANCH = "main"
 _FIRST_FORMAT: dict[str, Any] = {"spec_version": 1} if "spec_version" in signature(icechunk.Repository.create).parameters else {}
 """Icechunk 2 (which needs Python 3.12) reads and writes both formats, Icechunk 1 only the first: networks must travel."""
+_CONFIGURATION = icechunk.RepositoryConfig(
+    manifest=icechunk.ManifestConfig(
+        preload=icechunk.ManifestPreloadConfig(max_total_refs=0, preload_if=icechunk.ManifestPreloadCondition.false())
+    )
+)
+"""A question reads a few of the thousands of arrays; what Icechunk would read ahead of it at each opening is of others."""
 _TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
 READ_OVER_ROWS = 32
 _ABSENT = "no such network; make one with 'submin create'"
@@ -87,7 +93,7 @@ def _open_repository(place: str) -> icechunk.Repository:
     if not is_remote(place) and not Path(place).is_dir():
         raise StoreError(f"{place}: {_ABSENT}")
     try:
-        return icechunk.Repository.open(storage_of(place))
+        return icechunk.Repository.open(storage_of(place), config=_CONFIGURATION)
     except icechunk.IcechunkError as error:
         if not is_remote(place):
             raise StoreError(f"{place}: not a network ({reason_of(error)}); make one with 'submin create'") from None
