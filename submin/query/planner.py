@@ -236,9 +236,11 @@ def hold_all(source: NetworkSource, tiles: Sequence[int]) -> bool:
     """Whether some tiles together hold every cell of the network."""
     cover = source.cover
     held = {cell for tile in tiles for cell in cover.cells_held(tile)}
-    beyond = sorted({cell for tile in tiles for other in cover.neighbours(tile) for cell in cover.cells_owned(other)} - held)
-    # a neighbour's cell is proof enough, mostly; only without one must all cells be listed
-    return not source.existing(beyond) and held.issuperset(source.cell_numbers())
+    around = sorted({other for tile in tiles for other in cover.neighbours(tile)} - set(tiles))
+    # a cell of one neighbour is proof enough, mostly; only without one must all cells be listed
+    if any(source.existing([cell for cell in cover.cells_owned(other) if cell not in held]) for other in around):
+        return False
+    return held.issuperset(source.cell_numbers())
 
 
 def determined_parts(source: NetworkSource, selections: Sequence[Selection]) -> tuple[list[Selection], list[GroundPart]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from bisect import bisect_right
 from collections.abc import Awaitable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -172,6 +173,29 @@ async def _span(group: zarr.AsyncGroup, name: str, start: int, stop: int | None)
     return np.asarray(await array.getitem(slice(start, stop))) if stop > start else np.empty(0, dtype=array.dtype)
 
 
+async def _spans(group: zarr.AsyncGroup, name: str, spans: Sequence[tuple[int, int | None]]) -> list[AnyArray]:
+    """Several spans of an array of one dimension. Neighbours that meet in a chunk are one read: a chunk is decoded whole for each."""
+    array = await _array(group, name)
+    length, chunk = array.shape[0], array.chunks[0]
+    clipped = [(min(start, length), length if stop is None else min(stop, length)) for start, stop in spans]
+    reads: list[tuple[int, int]] = []
+    for start, stop in sorted(span for span in clipped if span[1] > span[0]):
+        if reads and start // chunk <= (reads[-1][1] - 1) // chunk:
+            reads[-1] = reads[-1][0], max(reads[-1][1], stop)
+        else:
+            reads.append((start, stop))
+    found = await _side_by_side(array.getitem(slice(start, stop)) for start, stop in reads)
+    firsts = [start for start, _ in reads]
+    values = []
+    for start, stop in clipped:
+        if stop <= start:
+            values.append(np.empty(0, dtype=array.dtype))
+            continue
+        read = bisect_right(firsts, start) - 1
+        values.append(np.asarray(found[read])[start - firsts[read] : stop - firsts[read]])
+    return values
+
+
 async def _parts(group: zarr.AsyncGroup, names: frozenset[str] | None) -> dict[str, AnyArray]:
     chosen = [entry for entry in group.attrs["layout"] if names is None or str(entry[0]).removesuffix(".ends") in names]
     spans: dict[str, tuple[int, int]] = {}
@@ -239,20 +263,22 @@ def read_spans(group: zarr.Group, wanted: Iterable[str] | None, spans: Sequence[
     kinds = attributes_of(group)["columns"]
     columns = list(kinds if wanted is None else wanted)
 
-    async def one(column: str, start: int, stop: int | None) -> AnyArray:
+    async def one(column: str) -> list[AnyArray]:
         if kinds[column] != "text":
-            return await _span(group._async_group, column, start, stop)
-        ends = await _span(group._async_group, column + ".ends", max(start - 1, 0), stop)
-        base = int(ends[0]) if start > 0 and len(ends) else 0
-        ends = ends[1:] if start > 0 else ends
-        data = await _span(group._async_group, column, base, int(ends[-1])) if len(ends) else np.empty(0, dtype=np.uint8)
-        return decode_text(data, ends - base)
+            return await _spans(group._async_group, column, spans)
+        # the end of the row before is where the first of a span begins
+        ends = await _spans(group._async_group, column + ".ends", [(max(start - 1, 0), stop) for start, stop in spans])
+        bases = [int(of[0]) if start > 0 and len(of) else 0 for (start, _), of in zip(spans, ends, strict=True)]
+        ends = [of[1:] if start > 0 else of for (start, _), of in zip(spans, ends, strict=True)]
+        bounds = [(base, int(of[-1]) if len(of) else base) for base, of in zip(bases, ends, strict=True)]
+        data = await _spans(group._async_group, column, bounds)
+        return [decode_text(text, of - base) for text, of, base in zip(data, ends, bases, strict=True)]
 
-    async def every() -> list[AnyArray]:
-        return await _side_by_side(one(column, start, stop) for start, stop in spans for column in columns)
+    async def every() -> list[list[AnyArray]]:
+        return await _side_by_side(map(one, columns))
 
-    read = iter(sync(every()))
-    return [{column: next(read) for column in columns} for _ in spans]
+    read = sync(every())
+    return [dict(zip(columns, of_span, strict=True)) for of_span in zip(*read, strict=True)] if columns else [{} for _ in spans]
 
 
 def replace_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:

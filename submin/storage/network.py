@@ -482,6 +482,13 @@ class Network(NetworkSource):
         """Block of every image."""
         return np.asarray(self._snapshot.image_columns(["block_id"])["block_id"], dtype=np.str_)
 
+    def _blocks_of(self, images: Index) -> tuple[str, ...]:
+        """Blocks, ascending, of some images (rows); rows beyond the network's have none."""
+        rows = images.tolist()
+        if all(row in self._plain_images for row in rows):  # those of a small question, which it has read: the table is not
+            return tuple(sorted({self._plain_images[row].block_id for row in rows}))
+        return tuple(np.unique(self._blocks[images[images < len(self._blocks)]]).tolist())
+
     @cached_property
     def _directory(self) -> Directory:
         return self._snapshot.directory()
@@ -489,7 +496,6 @@ class Network(NetworkSource):
     def control_set(self, found: Answer) -> ControlSet:
         """An answer as users get it; images behind it that are not in the network have no block there."""
         metadata, cover = self._snapshot.metadata, self.cover
-        blocks = self._blocks if len(found.images) else np.empty(0, dtype="U1")
         return ControlSet(
             ids=found.ids,
             geocentric=found.geocentric,
@@ -502,7 +508,7 @@ class Network(NetworkSource):
             tile_of_point=np.array([cover.tile_name(t) for t in found.owner], dtype=np.str_),
             rays=found.rays,
             version=self.version,
-            blocks=tuple(np.unique(blocks[found.images[found.images < len(blocks)]]).tolist()),
+            blocks=self._blocks_of(found.images),
             scope="network" if found.network_wide else "tiles",
             validity=self.validity.intervals(found.ids),
         )

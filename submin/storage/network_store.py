@@ -59,8 +59,14 @@ icechunk.set_logs_filter("icechunk=error")
 BRANCH = "main"
 _FIRST_FORMAT: dict[str, Any] = {"spec_version": 1} if "spec_version" in signature(icechunk.Repository.create).parameters else {}
 """Icechunk 2 (which needs Python 3.12) reads and writes both formats, Icechunk 1 only the first: networks must travel."""
+_CONFIGURATION = icechunk.RepositoryConfig(
+    manifest=icechunk.ManifestConfig(
+        preload=icechunk.ManifestPreloadConfig(max_total_refs=0, preload_if=icechunk.ManifestPreloadCondition.false())
+    )
+)
+"""A question reads a few of the thousands of arrays; what Icechunk would read ahead of it at each opening is of others."""
 _TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
-READ_OVER_ROWS = 256
+READ_OVER_ROWS = 32
 _ABSENT = "no such network; make one with 'submin create'"
 _TAKEN = "already exists; choose another place, or remove it first"
 
@@ -87,7 +93,7 @@ def _open_repository(place: str) -> icechunk.Repository:
     if not is_remote(place) and not Path(place).is_dir():
         raise StoreError(f"{place}: {_ABSENT}")
     try:
-        return icechunk.Repository.open(storage_of(place))
+        return icechunk.Repository.open(storage_of(place), config=_CONFIGURATION)
     except icechunk.IcechunkError as error:
         if not is_remote(place):
             raise StoreError(f"{place}: not a network ({reason_of(error)}); make one with 'submin create'") from None
@@ -224,7 +230,9 @@ class Snapshot:
         else:
             session = repository.readonly_session(snapshot_id=find_version(place, version).snapshot)
         try:
-            return cls(zarr.open_group(session.store, mode="r"), place, parameters=parameters)
+            # what Zarr would look for beside, an older format and metadata of all members in one place, is never there
+            root = zarr.open_group(session.store, mode="r", zarr_format=3, use_consolidated=False)
+            return cls(root, place, parameters=parameters)
         except FileNotFoundError:
             raise StoreError(f"{place}: holds a repository but no network; make one with 'submin create'") from None
 
@@ -301,12 +309,12 @@ class Snapshot:
     def plain_images(self, rows: Sequence[int] | NDArray[np.integer]) -> list[NetworkImage]:
         """Images of these rows (ascending), views of correlated control without their rows of the common factor (`with_joint`)."""
         table = group_of(self.root, "images")
-        wanted = [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence")]
+        wanted = [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence", "withdrawn")]
         if not len(rows):
             return []
         wanted_rows = np.asarray(rows, dtype=np.int64)
         found: list[NetworkImage] = []
-        # a run of neighbours is one read of each column; a long gap between them is not read
+        # rows of a long gap between neighbours are not decoded; runs that lie in one chunk are read together
         runs = np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1)
         for run, columns in zip(runs, read_spans(table, wanted, [(int(run[0]), int(run[-1]) + 1) for run in runs]), strict=True):
             found.extend(network_images({name: values[run - run[0]] for name, values in columns.items()}))
