@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.peers_outcome import Outcome, Times
 from benchmarks.peers_problem import ImageGroups, Problem, image_groups
-from orchestration.executors import own_peak_memory_mb
+from orchestration.memory import own_peak_memory_mb
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.peers_outcome import Outcome, Times
 from benchmarks.peers_problem import Problem
 from benchmarks.sparse_adjustment import SparseAdjustment, SparseSystem
-from orchestration.executors import own_peak_memory_mb
+from orchestration.memory import own_peak_memory_mb
 from submin.adjustment.elimination import PointFactors, point_covariances
 
 Array = NDArray[np.float64]

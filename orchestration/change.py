@@ -19,6 +19,7 @@ from orchestration.progress import Reporter
 from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, register_part, update_tile
 from submin.adjustment.images import ImageSet
 from submin.adjustment.surveyed_points import ContradictedPoint
+from submin.network.id_numbers import numbered
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import (
     LooseRays,
@@ -278,16 +279,29 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
 
 def _origins(move: Move) -> dict[int, tuple[int, ...]]:
     """For each cell at which points arrive from other cells that are still there: these cells."""
-    names = np.concatenate([np.empty(0, dtype="U1"), *move.out.departures.values()])
-    left = np.repeat(np.array(list(move.out.departures), dtype=np.int64), [len(ids) for ids in move.out.departures.values()])
-    order = np.argsort(names)
-    found = {}
-    for cell, arriving in move.registration.arrivals.items():
-        known = np.isin(arriving.point_ids, names)
-        came_from = left[order[np.searchsorted(names, arriving.point_ids[known], sorter=order)]]
-        if others := set(came_from.tolist()) - {cell}:
-            found[cell] = tuple(sorted(others))
+    coming, going = _by_cell({c: points.point_ids for c, points in move.registration.arrivals.items()}), _by_cell(move.out.departures)
+    ids, place = numbered(np.concatenate([going.ids, coming.ids]))
+    cell_before = np.full(len(ids), -1, dtype=np.int64)
+    cell_before[place[: len(going.ids)]] = going.cell
+    left = cell_before[place[len(going.ids) :]]
+    moved = (left >= 0) & (left != coming.cell)
+    found: dict[int, tuple[int, ...]] = {}
+    for to, origin in np.unique(np.column_stack([coming.cell[moved], left[moved]]), axis=0).tolist():
+        found[to] = (*found.get(to, ()), origin)
     return found
+
+
+@dataclass(frozen=True)
+class _InCells:
+    """Ids (n,) of points, and the cell (n,) of each."""
+
+    ids: Ids
+    cell: NDArray[np.int64]
+
+
+def _by_cell(points: Mapping[int, Ids]) -> _InCells:
+    cells = np.repeat(np.array(list(points), dtype=np.int64), [len(ids) for ids in points.values()])
+    return _InCells(np.concatenate([np.empty(0, dtype="U1"), *points.values()]), cells)
 
 
 def _changes(base: Snapshot, move: Move, reports: Sequence[TileReport], origins: Mapping[int, Sequence[int]]) -> Changes:
@@ -298,8 +312,12 @@ def _changes(base: Snapshot, move: Move, reports: Sequence[TileReport], origins:
     cover = move.cover
     lost = {report.tile for report in reports if report.lost}
     lost |= {base.cover.owner(c) for c in base.cell_numbers() if base.cover.cell_name(c) in move.out.dissolved}
-    arriving = np.concatenate([np.empty(0, dtype="U1"), *(a.point_ids for a in move.registration.arrivals.values())])
-    lost |= {cover.owner(c) for c, ids in move.out.departures.items() if not np.isin(ids, arriving).all()}
+    ids, cells = move.registration.directory
+    going = _by_cell(move.out.departures)
+    known, place = numbered(np.concatenate([ids[cells >= 0], going.ids]))
+    stays = np.zeros(len(known), dtype=np.bool_)
+    stays[place[: np.count_nonzero(cells >= 0)]] = True
+    lost |= {cover.owner(c) for c in np.unique(going.cell[~stays[place[np.count_nonzero(cells >= 0) :]]]).tolist()}
     if any(report.lost_elsewhere for report in reports):
         lost.add(EVERYWHERE)
     stale = {tile for to, cells in origins.items() for c in cells for tile in set(cover.holders(to)) - set(cover.holders(c))}
