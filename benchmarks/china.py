@@ -21,6 +21,7 @@ from benchmarks.comparison import below, between, data, verdict
 from benchmarks.held_back import held_back
 from benchmarks.peers_outcome import relative_difference
 from benchmarks.product import submin_json
+from benchmarks.record import write_record
 from benchmarks.sparse_adjustment import SparseAdjustment, adjusted_points, located
 from orchestration.executors import executor_for
 from orchestration.run import run
@@ -33,24 +34,32 @@ Rows = list[dict[str, Any]]
 
 RUN_SECONDS, RECONCILE_SECONDS, TRIPLET_SECONDS, MEMORY_MB = 240.0, 120.0, 2.0, 8192.0
 AGREE, SAMPLED = 1e-6, 1000
+OVERLAP_KM = 10.0
+"""Once tiles are reconciled an overlap adds nothing, and a wide one is what costs: each of its rays is judged by every tile that holds it."""
 SEEDS = 6
 TENTH = 0.1
 WITHIN = (85.0, 95.0)
 """Per cent of check points within the stated CE90 and LE90, over all realisations."""
 
 
-def measure(scale: float, workers: int) -> Rows:
-    """Rows of the stages, of the tasks, of what was found, and of the realisations; ``scale`` is the part of China."""
+def measure(scale: float, workers: int, out: Path | None = None) -> Rows:
+    """Rows of the stages, of the tasks, of what was found, and of the realisations; ``scale`` is the part of China.
+
+    ``out``: folder for ``china.json``.
+    """
     with tempfile.TemporaryDirectory() as folder:
         rows, tasks, found = _whole(Path(folder), scale, workers)
-    return [*rows, *tasks, *found, *_realisations(scale * TENTH, workers)]
+    every = [*rows, *tasks, *found, *_realisations(scale * TENTH, workers)]
+    if out is not None:
+        write_record(out, "china", scale, workers, every)
+    return every
 
 
 def _whole(folder: Path, scale: float, workers: int) -> tuple[Rows, Rows, Rows]:
     catalogue, network = folder / "catalogue", folder / "network"
     made = submin_json("simulate", "china", "--out", catalogue, "--scale", scale, "--workers", workers)
     held_back(catalogue, made["blocks"] // 2, folder / "rest", folder / "one")
-    submin_json("create", network, "--fit", catalogue)
+    submin_json("create", network, "--fit", catalogue, "--overlap-km", OVERLAP_KM)
     ran = submin_json("run", folder / "rest", network, "--workers", workers, "--no-reconcile")
     outside = submin_json("reconcile", network, "--workers", workers)
     checked = submin_json("check", network, catalogue / "check.parquet")
@@ -139,7 +148,7 @@ def _realisations(scale: float, workers: int) -> Rows:
         for seed in range(1, SEEDS + 1):
             catalogue, network = Path(folder) / f"catalogue-{seed}", Path(folder) / f"network-{seed}"
             submin_json("simulate", "china", "--out", catalogue, "--scale", scale, "--seed", seed, "--workers", workers)
-            submin_json("create", network, "--fit", catalogue)
+            submin_json("create", network, "--fit", catalogue, "--overlap-km", OVERLAP_KM)
             submin_json("run", catalogue, network, "--workers", workers)
             every.append(submin_json("check", network, catalogue / "check.parquet"))
     rows = [

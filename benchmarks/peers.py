@@ -10,22 +10,20 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import multiprocessing
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.comparison import DATA, below, data
-from benchmarks.machine import machine
 from benchmarks.peers_ours import Besides, adjust, write_catalogues
 from benchmarks.peers_outcome import Difference, Outcome
 from benchmarks.peers_problem import Problem
+from benchmarks.record import write_record
 from orchestration.commands.simulate import COUNTRIES
 from orchestration.executors import executor_for
 from orchestration.simulate import shared_data
@@ -84,18 +82,7 @@ def measure(scale: float, workers: int, out: Path | None = None) -> list[dict[st
             table, claims = table + rows, claims + asked
     every = [*table, *claims, *_versions()]
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        host = machine() | {row["package"]: row["version"] for row in every if "package" in row}
-        record = {
-            "benchmark": "peers",
-            "date": date.today().isoformat(),
-            "scale": scale,
-            "workers": workers,
-            "machine": host,
-            "rows": every,
-        }
-        text = json.dumps(record, indent=1, ensure_ascii=False)
-        (out / "peers.json").write_text(text + "\n", encoding="utf-8")
+        write_record(out, "peers", scale, workers, every, {row["package"]: row["version"] for row in every if "package" in row})
     return every
 
 

@@ -10,8 +10,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from benchmarks.china import OVERLAP_KM
 from benchmarks.comparison import verdict
 from benchmarks.product import submin_json
+from benchmarks.record import write_record
 
 Rows = list[dict[str, Any]]
 
@@ -21,8 +23,11 @@ BATCH_BLOCKS = 440
 """Blocks of a commit: two batches in the smallest part, so that every part is one of several."""
 
 
-def measure(scale: float, workers: int) -> Rows:
-    """Rows of each part of China (times ``scale``) on so many workers, of the smallest on one, and of what is asked for."""
+def measure(scale: float, workers: int, out: Path | None = None) -> Rows:
+    """Rows of each part of China (times ``scale``) on so many workers, of the smallest on one, and of what is asked for.
+
+    ``out``: folder for ``scaling.json``.
+    """
     rows = []
     for part in PARTS:
         with tempfile.TemporaryDirectory() as folder:
@@ -32,16 +37,19 @@ def measure(scale: float, workers: int) -> Rows:
     by_part = [row for row in rows if row["workers"] == workers]
     alone = next((row for row in rows if row["workers"] == 1), rows[0])
     times, memory = [row["ms a block"] for row in by_part], [row["peak, MB"] for row in by_part]
-    return [
+    every = [
         *rows,
         _claim(f"{workers} workers against one, the smallest part", alone["seconds"] / by_part[0]["seconds"], SPEED_UP, above=True),
         _claim("time a block, most to least", max(times) / min(times), TIME_SPREAD),
         _claim("peak memory, most to least", max(memory) / min(memory), MEMORY_SPREAD),
     ]
+    if out is not None:
+        write_record(out, "scaling", scale, workers, every)
+    return every
 
 
 def _ran(catalogue: Path, network: Path, part: float, workers: int) -> dict[str, Any]:
-    submin_json("create", network, "--fit", catalogue)
+    submin_json("create", network, "--fit", catalogue, "--overlap-km", OVERLAP_KM)
     ran = submin_json("run", catalogue, network, "--workers", workers, "--batch-blocks", BATCH_BLOCKS, "--no-reconcile")
     outside = submin_json("reconcile", network, "--workers", workers)
     blocks = ran["blocks_fused"]
