@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
+from orchestration.memory import give_back
 from orchestration.progress import Reporter, Silent
 from orchestration.read_ahead import batches_ahead
 from orchestration.task_record import TaskRecord
@@ -201,6 +202,7 @@ def fuse_blocks(
             refused = [Rejected.of(block, reason) for block, reason in batch if reason is not None]
             tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, innovation, check_points))
             reporter.fused(len(batch))
+            give_back()
     return tally
 
 

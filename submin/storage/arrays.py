@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from bisect import bisect_right
 from collections.abc import Awaitable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,10 @@ from submin.network.id_hash import hash_ids as hash_ids  # by which the director
 AnyArray = NDArray[Any]
 T = TypeVar("T")
 
-REALS_CHUNK = 1 << 17
+RECORD_CHUNK = 1 << 20
+"""Bytes of a chunk of a record."""
+ALIGNED = 8
+"""Parts of a record begin at multiples of so many bytes."""
 TABLE_CHUNK = 1 << 16
 
 
@@ -63,32 +67,33 @@ def decode_text(data: NDArray[np.uint8], ends: NDArray[np.int64]) -> NDArray[np.
 
 
 def write_record(parent: zarr.Group, name: str, parts: Mapping[str, AnyArray], attributes: Mapping[str, Any] | None = None) -> zarr.Group:
-    """Write a record of named arrays, replacing any record of that name. Booleans and integers become int64, floats float64."""
-    kinds: dict[str, list[AnyArray]] = {"reals": [], "integers": [], "bytes": []}
-    layout: list[list[Any]] = []
+    """Write a record of named arrays, replacing any record of that name. Booleans and integers come back as int64, floats as float64.
 
-    def put(part: str, kind: str, values: AnyArray) -> None:
-        start = sum(a.size for a in kinds[kind])
-        kinds[kind].append(values.ravel())
-        layout.append([part, kind, start, list(values.shape)])
+    All parts are one array of bytes: opening an array costs more than reading most of them. What is read together should be given together.
+    """
+    pieces: list[AnyArray] = []
+    layout: list[list[Any]] = []
+    size = 0
+
+    def put(part: str, values: AnyArray) -> None:
+        nonlocal size
+        values = np.ascontiguousarray(values, dtype=np.float64 if values.dtype.kind == "f" else values.dtype.newbyteorder("<"))
+        layout.append([part, values.dtype.str, size, list(values.shape)])
+        pieces.append(values.reshape(-1).view(np.uint8))
+        pieces.append(np.zeros(-values.nbytes % ALIGNED, dtype=np.uint8))
+        size += values.nbytes + pieces[-1].size
 
     for part, values in parts.items():
         if values.dtype.kind == "U":
             data, ends = encode_text(values)
-            put(part, "bytes", data)
-            put(part + ".ends", "integers", ends)
-        elif values.dtype.kind == "f":
-            put(part, "reals", values.astype(np.float64, copy=False))
+            put(part, data)
+            put(part + ".ends", ends)
         else:
-            put(part, "integers", values.astype(np.int64, copy=False))
+            put(part, values)
     # attributes at creation: each later change of one costs as much as an array
     group = parent.create_group(name, overwrite=True, attributes={"layout": layout, **(attributes or {})})
-    for kind, arrays in kinds.items():
-        if arrays:
-            data = np.concatenate(arrays)
-            if data.size:
-                options: dict[str, Any] = {"compressors": None} if kind == "reals" else {}
-                group.create_array(kind, data=data, chunks=(min(REALS_CHUNK, data.size),), **options)
+    if size:
+        group.create_array("data", data=np.concatenate(pieces), chunks=(min(RECORD_CHUNK, size),), compressors=None)
     return group
 
 
@@ -197,19 +202,20 @@ async def _spans(group: zarr.AsyncGroup, name: str, spans: Sequence[tuple[int, i
 
 
 async def _parts(group: zarr.AsyncGroup, names: frozenset[str] | None) -> dict[str, AnyArray]:
-    chosen = [entry for entry in group.attrs["layout"] if names is None or str(entry[0]).removesuffix(".ends") in names]
-    spans: dict[str, tuple[int, int]] = {}
-    for _, kind, start, shape in chosen:
-        stop = start + int(np.prod(shape))
-        low, high = spans.get(kind, (start, stop))
-        spans[kind] = (min(low, start), max(high, stop))
-    filled = [kind for kind, (low, high) in spans.items() if high > low]  # an array without entries is not stored
-    read = await _side_by_side(_span(group, kind, *spans[kind]) for kind in filled)
-    data = dict.fromkeys(spans, np.empty(0)) | dict(zip(filled, read, strict=True))
+    chosen = [
+        (str(part), np.dtype(kind), int(start), tuple(shape))
+        for part, kind, start, shape in group.attrs["layout"]
+        if names is None or str(part).removesuffix(".ends") in names
+    ]
+    low = min((start for _, _, start, _ in chosen), default=0)
+    high = max((start + kind.itemsize * math.prod(shape) for _, kind, start, shape in chosen), default=0)
+    # an array without entries is not stored
+    data = await _span(group, "data", low, high) if high > low else np.empty(0, dtype=np.uint8)
     parts: dict[str, AnyArray] = {}
     for part, kind, start, shape in chosen:
-        at = start - spans[kind][0]
-        parts[part] = data[kind][at : at + int(np.prod(shape))].reshape(shape)
+        at = start - low
+        values = data[at : at + kind.itemsize * math.prod(shape)].view(kind).reshape(shape)
+        parts[part] = values.astype(np.int64) if kind.kind in "bi" else values
     for part in [p for p in parts if p.endswith(".ends")]:
         ends = parts.pop(part)
         parts[part.removesuffix(".ends")] = decode_text(parts[part.removesuffix(".ends")], ends.astype(np.int64))

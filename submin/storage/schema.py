@@ -22,7 +22,7 @@ from submin.network.sub_min import SubMin, wider
 from submin.storage.arrays import Record, array_of, attributes_of, group_of, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 COVARIANCE_CHUNK = 256
 
 IMAGE_COLUMNS = {
@@ -111,8 +111,8 @@ def write_cell(root: zarr.Group, name: str, cell: Cell, square_px: float, pixel_
         group_of(root, "cells"), name,
         {
             "point_ids": cell.point_ids, "ray_point": rays.point, "ray_image": rays.image, "accepted": rays.accepted,
-            "images": cell.images, "origin": cell.origin, "linearised_at": cell.linearised_at, "theta": cell.theta,
-            "observed": rays.observed, "sigma": rays.sigma, "vector": sums.vector, "information": packed(sums.information),
+            "origin": cell.origin, "linearised_at": cell.linearised_at, "theta": cell.theta, "observed": rays.observed, "sigma": rays.sigma,
+            "images": cell.images, "vector": sums.vector, "information": packed(sums.information),
         },
         {"number": cell.number, "misclosure": sums.misclosure, "redundancy": sums.redundancy,
          "points": len(cell.point_ids), "determined": int(determined(cell).sum()), "rays": len(rays), "accepted": int(rays.accepted.sum()),

@@ -62,7 +62,7 @@ class Store:
         record = read_record(group)
         for part, change in parts.items():
             change(record[part])
-        others = {key: array_of(group, key)[...] for key in group.array_keys() if key not in ("reals", "integers", "bytes")}
+        others = {key: array_of(group, key)[...] for key in group.array_keys() if key not in ("data",)}
         path, _, last = name.rpartition("/")
         written = write_record(group_of(self.root, path), last, record, attributes)
         for key, values in others.items():
@@ -282,7 +282,7 @@ def broken_camera(store: Store) -> list[Found]:
 
 
 def missing_array(store: Store) -> list[Found]:
-    del store.root[f"cells/{store.cell_name}/reals"]
+    del store.root[f"cells/{store.cell_name}/data"]
     return [("unreadable", store.owner)]
 
 

@@ -114,10 +114,10 @@ def test_only_what_is_wanted_is_read(wanted: list[str]) -> None:
     assert_same(read_record(group_of(group, "cell"), wanted), {name: parts()[name] for name in wanted})
 
 
-def test_record_has_at_most_three_arrays() -> None:
+def test_record_has_at_most_one_array() -> None:
     group = root()
     write_record(group, "cell", parts())
-    assert sorted(group_of(group, "cell").array_keys()) == ["bytes", "integers", "reals"]
+    assert sorted(group_of(group, "cell").array_keys()) == ["data"]
     write_record(group, "empty", {"none": np.empty((0, 3)), "ids": np.empty(0, dtype="U1")})
     assert list(group_of(group, "empty").array_keys()) == []
     assert_same(read_record(group_of(group, "empty")), {"none": np.empty((0, 3)), "ids": np.empty(0, dtype="U1")})
