@@ -19,7 +19,7 @@ from submin.storage.point_table import PointTable
 Array = NDArray[np.float64]
 
 JOINT_POINTS = 2000
-"""Points whose joint covariance is formed at once (288 MB); more are checked in groups of neighbours."""
+"""Points whose joint covariance is formed at once (288 MB); more are checked core by core."""
 
 
 @dataclass(frozen=True)
@@ -107,14 +107,17 @@ def check(network: Network, points: PointTable, policy: str, advance: Callable[[
 
 
 def _groups(network: Network, ids: NDArray[np.str_], policy: str) -> Iterator[ControlSet]:
-    """Answers for all points that can be answered for, neighbours together."""
+    """Answers for all points that can be answered for: together, or where they are many those of one core, which few tiles answer for."""
     group: list[NDArray[np.str_]] = []
-    for members in network.cells_of_points(ids).values():
+    many, core = len(ids) > JOINT_POINTS, -1
+    for cell, members in sorted(network.cells_of_points(ids).items(), key=lambda item: network.cover.owner(item[0])):
         for start in range(0, len(members), JOINT_POINTS):
             part = members[start : start + JOINT_POINTS]
-            if sum(map(len, group)) + len(part) > JOINT_POINTS:
+            left = many and network.cover.owner(cell) != core
+            if group and (left or sum(map(len, group)) + len(part) > JOINT_POINTS):
                 yield network.query(points=np.concatenate(group), policy=policy)
                 group = []
             group.append(part)
+            core = network.cover.owner(cell)
     if group:
         yield network.query(points=np.concatenate(group), policy=policy)

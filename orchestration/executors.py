@@ -307,9 +307,9 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         return
     compile_kernels()
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    # set before the workers load numpy; freed memory goes back to the system at once, or workers grow with every batch (Dask's own choice)
+    # set before the workers load numpy
     settings = {
-        "distributed.nanny.pre-spawn-environ": threads | {"MALLOC_TRIM_THRESHOLD_": "65536"}, "distributed.worker.memory.terminate": False,
+        "distributed.nanny.pre-spawn-environ": threads, "distributed.worker.memory.terminate": False,
         # a killed worker may take long to come again where machines are busy; given up after this, it never would, and be waited for
         "distributed.deploy.lost-worker-timeout": "1 day",
     }  # fmt: skip
