@@ -34,8 +34,8 @@ Rows = list[dict[str, Any]]
 
 RUN_SECONDS, RECONCILE_SECONDS, TRIPLET_SECONDS, MEMORY_MB = 240.0, 120.0, 2.0, 8192.0
 AGREE, SAMPLED = 1e-6, 1000
-OVERLAP_KM = 10.0
-"""Once tiles are reconciled an overlap adds nothing, and a wide one costs: its rays are judged by every tile that holds them."""
+OVERLAP_KM = 0.0
+"""Once tiles are reconciled an overlap adds nothing, and it costs: its rays are judged by every tile that holds them."""
 SEEDS = 6
 TENTH = 0.1
 WITHIN = (85.0, 95.0)

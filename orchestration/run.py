@@ -28,7 +28,7 @@ from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import writing
 
-DEFAULT_BATCH_BLOCKS = 500
+DEFAULT_BATCH_BLOCKS = 2000
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def run(
     network: Annotated[str, typer.Argument(help="Network that takes them.")],
     workers: Workers = 0,
     scheduler: Scheduler = None,
-    batch_blocks: Annotated[int, typer.Option("--batch-blocks", help="Blocks that one commit holds.")] = 500,
+    batch_blocks: Annotated[int, typer.Option("--batch-blocks", help="Blocks that one commit holds.")] = 2000,
     sequential: Annotated[bool, typer.Option("--sequential", help="Fuse block by block, in the order of the catalogue.")] = False,
     innovation: Annotated[
         float,
