@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import submin
+from benchmarks.china_figure import plot
 from benchmarks.comparison import below, between, data, verdict
 from benchmarks.held_back import held_back
 from benchmarks.peers_outcome import relative_difference
@@ -34,6 +35,7 @@ Rows = list[dict[str, Any]]
 
 RUN_SECONDS, RECONCILE_SECONDS, TRIPLET_SECONDS, MEMORY_MB = 240.0, 120.0, 2.0, 8192.0
 AGREE, SAMPLED = 1e-6, 1000
+STAGE_NAMES = ("catalogue simulated", "run, catalogue to committed network", "reconcile", "one more triplet, to its committed version")
 OVERLAP_KM = 0.0
 """Once tiles are reconciled an overlap adds nothing, and it costs: its rays are judged by every tile that holds them."""
 SEEDS = 6
@@ -45,17 +47,19 @@ WITHIN = (85.0, 95.0)
 def measure(scale: float, workers: int, out: Path | None = None) -> Rows:
     """Rows of the stages, of the tasks, of what was found, and of the realisations; ``scale`` is the part of China.
 
-    ``out``: folder for ``china.json``.
+    ``out``: folder for ``china.json`` and ``china.png``.
     """
     with tempfile.TemporaryDirectory() as folder:
-        rows, tasks, found = _whole(Path(folder), scale, workers)
+        rows, tasks, found = whole(Path(folder), scale, workers)
     every = [*rows, *tasks, *found, *_realisations(scale * TENTH, workers)]
     if out is not None:
         write_record(out, "china", scale, workers, every)
+        plot(every, workers, out)
     return every
 
 
-def _whole(folder: Path, scale: float, workers: int) -> tuple[Rows, Rows, Rows]:
+def whole(folder: Path, scale: float, workers: int) -> tuple[Rows, Rows, Rows]:
+    """Rows of the stages, of their tasks, and of what was found, of one part of China."""
     catalogue, network = folder / "catalogue", folder / "network"
     made = submin_json("simulate", "china", "--out", catalogue, "--scale", scale, "--workers", workers)
     held_back(catalogue, made["blocks"] // 2, folder / "rest", folder / "one")
@@ -68,10 +72,10 @@ def _whole(folder: Path, scale: float, workers: int) -> tuple[Rows, Rows, Rows]:
     full = scale >= 1.0
     blocks = ran["blocks_fused"]
     rows = [
-        _stage("catalogue simulated", made["blocks"], made["seconds"], made["peak_memory_mb"], None),
-        _stage("run, catalogue to committed network", blocks, ran["seconds"], ran["peak_memory_mb"], RUN_SECONDS if full else None),
-        _stage("reconcile", blocks, outside["seconds"], outside["peak_memory_mb"], RECONCILE_SECONDS if full else None),
-        _stage("one more triplet, to its committed version", 1, one, None, TRIPLET_SECONDS),
+        _stage(STAGE_NAMES[0], made["blocks"], made["seconds"], made["peak_memory_mb"], None),
+        _stage(STAGE_NAMES[1], blocks, ran["seconds"], ran["peak_memory_mb"], RUN_SECONDS if full else None),
+        _stage(STAGE_NAMES[2], blocks, outside["seconds"], outside["peak_memory_mb"], RECONCILE_SECONDS if full else None),
+        _stage(STAGE_NAMES[3], 1, one, None, TRIPLET_SECONDS),
     ]
     tasks = [*_tasks("run", ran["tasks"]), *_tasks("reconcile", outside["tasks"])]
     found = [
