@@ -96,7 +96,7 @@ def test_by_rays_or_by_covariances_it_is_the_same_number() -> None:
     block = _blocks(region.images, priors, region.point_ids[region.point], region.image, observed, sigma)[0]
     of_block = block_rays(block)
     images = image_set(of_block.images, WGS84, 6)
-    ids, point = np.unique(of_block.point_ids, return_inverse=True)
+    ids, point = of_block.ids, of_block.point
     rays = sorted_rays(point.astype(np.int32), of_block.image, of_block.observed, of_block.sigma, np.ones(len(point), dtype=np.bool_))
     result = adjust(images, rays, intersect(images, rays, len(ids)))
     free = quality(images, rays, result)
