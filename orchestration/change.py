@@ -313,11 +313,11 @@ def _changes(base: Snapshot, move: Move, reports: Sequence[TileReport], origins:
     lost = {report.tile for report in reports if report.lost}
     lost |= {base.cover.owner(c) for c in base.cell_numbers() if base.cover.cell_name(c) in move.out.dissolved}
     ids, cells = move.registration.directory
-    going = _by_cell(move.out.departures)
-    known, place = numbered(np.concatenate([ids[cells >= 0], going.ids]))
+    placed, going = ids[cells >= 0], _by_cell(move.out.departures)
+    known, number = numbered(np.concatenate([placed, going.ids]))
     stays = np.zeros(len(known), dtype=np.bool_)
-    stays[place[: np.count_nonzero(cells >= 0)]] = True
-    lost |= {cover.owner(c) for c in np.unique(going.cell[~stays[place[np.count_nonzero(cells >= 0) :]]]).tolist()}
+    stays[number[: len(placed)]] = True
+    lost |= {cover.owner(c) for c in np.unique(going.cell[~stays[number[len(placed) :]]]).tolist()}
     if any(report.lost_elsewhere for report in reports):
         lost.add(EVERYWHERE)
     stale = {tile for to, cells in origins.items() for c in cells for tile in set(cover.holders(to)) - set(cover.holders(c))}

@@ -16,8 +16,12 @@ def batches_ahead(values: Iterable[T], size: int) -> Iterator[list[T]]:
     An error of ``values`` is raised where their list would come.
     """
     left = iter(values)
+
+    def next_batch() -> list[T]:
+        return list(islice(left, size))
+
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as reader:
-        following = reader.submit(lambda: list(islice(left, size)))
+        following = reader.submit(next_batch)
         while batch := following.result():
-            following = reader.submit(lambda: list(islice(left, size)))
+            following = reader.submit(next_batch)
             yield batch
