@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import math
 from bisect import bisect_right
-from collections.abc import Awaitable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import zarr
 from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.core.sync import sync
 
 from submin.errors import StoreError
@@ -20,12 +22,19 @@ from submin.network.id_hash import hash_ids as hash_ids  # by which the director
 
 AnyArray = NDArray[Any]
 T = TypeVar("T")
+Places = slice | NDArray[np.int64]
+EVERY = slice(None)
 
 RECORD_CHUNK = 1 << 20
 """Bytes of a chunk of a record."""
 ALIGNED = 8
 """Parts of a record begin at multiples of so many bytes."""
 TABLE_CHUNK = 1 << 16
+"""Rows of a chunk of a table."""
+PLAIN = (Crc32cCodec(),)
+"""Chunks as they are, each with a checksum: numbers do not compress, and what was damaged must not be read as another number."""
+PACKED = (ZstdCodec(level=0), Crc32cCodec())
+"""Compressed chunks, each with a checksum: of tables."""
 
 
 def group_of(parent: zarr.Group, name: str) -> zarr.Group:
@@ -42,6 +51,33 @@ def array_of(group: zarr.Group, name: str) -> zarr.Array[Any]:
     if not isinstance(found, zarr.Array):
         raise StoreError(f"the store has no array {name!r} in {group.path!r}; it is damaged")
     return found
+
+
+@contextmanager
+def sound_chunks(where: str) -> Iterator[None]:
+    """Say in one line that a chunk of an array is not what was written.
+
+    Raises
+    ------
+    StoreError
+        In place of what decoding raised: a checksum or a length that does not fit.
+    """
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:
+        raise StoreError(
+            f"the store has a damaged chunk in {where!r} ({error}); 'submin verify' tells which tiles it concerns: "
+            "go on from a copy of the network, or make it again from its catalogue"
+        ) from error
+
+
+def read_matrix(group: zarr.Group, name: str, rows: Places = EVERY, columns: Places = EVERY) -> AnyArray:
+    """A matrix of a group: all of it, spans of its rows and columns, or those at some places (ascending)."""
+    array = array_of(group, name)
+    with sound_chunks(array.path):
+        if isinstance(rows, slice) or len(rows) == array.shape[0]:  # places one by one take much longer
+            return np.asarray(array[rows if isinstance(rows, slice) else EVERY, columns if isinstance(columns, slice) else EVERY])
+        return np.asarray(array.oindex[rows, columns])
 
 
 def attributes_of(group: zarr.Group) -> dict[str, Any]:
@@ -93,7 +129,7 @@ def write_record(parent: zarr.Group, name: str, parts: Mapping[str, AnyArray], a
     # attributes at creation: each later change of one costs as much as an array
     group = parent.create_group(name, overwrite=True, attributes={"layout": layout, **(attributes or {})})
     if size:
-        group.create_array("data", data=np.concatenate(pieces), chunks=(min(RECORD_CHUNK, size),), compressors=None)
+        group.create_array("data", data=np.concatenate(pieces), chunks=(min(RECORD_CHUNK, size),), compressors=PLAIN)
     return group
 
 
@@ -175,7 +211,10 @@ async def _span(group: zarr.AsyncGroup, name: str, start: int, stop: int | None)
     """Entries of an array of one dimension, from ``start`` to before ``stop``."""
     array = await _array(group, name)
     stop = array.shape[0] if stop is None else min(stop, array.shape[0])
-    return np.asarray(await array.getitem(slice(start, stop))) if stop > start else np.empty(0, dtype=array.dtype)
+    if stop <= start:
+        return np.empty(0, dtype=array.dtype)
+    with sound_chunks(array.path):
+        return np.asarray(await array.getitem(slice(start, stop)))
 
 
 async def _spans(group: zarr.AsyncGroup, name: str, spans: Sequence[tuple[int, int | None]]) -> list[AnyArray]:
@@ -189,7 +228,8 @@ async def _spans(group: zarr.AsyncGroup, name: str, spans: Sequence[tuple[int, i
             reads[-1] = reads[-1][0], max(reads[-1][1], stop)
         else:
             reads.append((start, stop))
-    found = await _side_by_side(array.getitem(slice(start, stop)) for start, stop in reads)
+    with sound_chunks(array.path):
+        found = await _side_by_side(array.getitem(slice(start, stop)) for start, stop in reads)
     firsts = [start for start, _ in reads]
     values = []
     for start, stop in clipped:
@@ -227,10 +267,10 @@ def create_table(parent: zarr.Group, name: str, columns: Mapping[str, str]) -> z
     group = parent.create_group(name)
     for column, kind in columns.items():
         if kind == "text":
-            group.create_array(column, shape=(0,), chunks=(1 << 20,), dtype="uint8")
-            group.create_array(column + ".ends", shape=(0,), chunks=(TABLE_CHUNK,), dtype="int64")
+            group.create_array(column, shape=(0,), chunks=(1 << 20,), dtype="uint8", compressors=PACKED)
+            group.create_array(column + ".ends", shape=(0,), chunks=(TABLE_CHUNK,), dtype="int64", compressors=PACKED)
         else:
-            group.create_array(column, shape=(0,), chunks=(TABLE_CHUNK,), dtype=kind)
+            group.create_array(column, shape=(0,), chunks=(TABLE_CHUNK,), dtype=kind, compressors=PACKED)
     group.attrs["columns"] = dict(columns)
     return group
 
@@ -253,10 +293,16 @@ def append_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
             data, ends = encode_text(values)
             base = array_of(group, column).shape[0]
             if data.size:
-                array_of(group, column).append(data)
-            array_of(group, column + ".ends").append(ends + base)
+                _append(group, column, data)
+            _append(group, column + ".ends", ends + base)
         else:
-            array_of(group, column).append(values.astype(kinds[column]))
+            _append(group, column, values.astype(kinds[column]))
+
+
+def _append(group: zarr.Group, name: str, values: AnyArray) -> None:
+    array = array_of(group, name)
+    with sound_chunks(array.path):  # the last chunk is read, and written with more in it
+        array.append(values)
 
 
 def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: int = 0, stop: int | None = None) -> dict[str, AnyArray]:
@@ -299,4 +345,6 @@ def replace_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
 def set_rows(group: zarr.Group, column: str, rows: NDArray[np.int64], values: AnyArray) -> None:
     """Change some rows of a column that is not text."""
     if len(rows):
-        array_of(group, column).oindex[rows] = values
+        array = array_of(group, column)
+        with sound_chunks(array.path):
+            array.oindex[rows] = values

@@ -15,11 +15,12 @@ from submin.network.dense_sub_min import DenseSubMin
 from submin.network.observations import Cluster
 from submin.network.triangle import PANEL, Triangle
 from submin.storage.arrays import (
+    PLAIN,
     append_table,
-    array_of,
     attributes_of,
     create_table,
     group_of,
+    read_matrix,
     read_record,
     read_table,
     table_length,
@@ -147,7 +148,7 @@ def write_state(root: zarr.Group, state: DenseSubMin, inner: Mapping[str, tuple[
     )  # fmt: skip
     size = state.triangle.size
     chunk = min(COVARIANCE_CHUNK, max(size, 1))
-    array = record.create_array("covariance", shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=None)
+    array = record.create_array("covariance", shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=PLAIN)
     for k, panel in enumerate(state.triangle.panels):
         start, stop = k * PANEL, min((k + 1) * PANEL, size)
         array[start:stop, :stop] = panel[:stop, : stop - start].T  # a block column of the one triangle is a block row of the other
@@ -183,19 +184,18 @@ def read_points(snapshot: Snapshot) -> DensePoints:
 
 def read_covariance(snapshot: Snapshot, rows: Rows) -> Array:
     """Joint covariance (3k, 3k) of the points at these places (ascending), square metres; only the blocks concerned are read."""
-    array = array_of(group_of(group_of(snapshot.root, GROUP), "points"), "covariance")
+    group = group_of(group_of(snapshot.root, GROUP), "points")
     at = (3 * rows[:, None] + np.arange(3)).ravel()
-    whole = len(at) == array.shape[0]
-    return fill_symmetric(np.ascontiguousarray(array[:, :] if whole else array.oindex[at, at]) if len(at) else np.empty((0, 0)))
+    return fill_symmetric(np.ascontiguousarray(read_matrix(group, "covariance", at, at)) if len(at) else np.empty((0, 0)))
 
 
 def read_state(snapshot: Snapshot) -> DenseSubMin:
     """The whole state, to be fused into."""
     group = group_of(group_of(snapshot.root, GROUP), "points")
     parts, attributes = read_record(group), attributes_of(group)
-    array, triangle = array_of(group, "covariance"), Triangle()
-    for start in range(0, array.shape[0], PANEL):
-        rows = np.asarray(array[start : start + PANEL, : start + PANEL])
+    size, triangle = 3 * len(parts["ids"]), Triangle()
+    for start in range(0, size, PANEL):
+        rows = read_matrix(group, "covariance", slice(start, start + PANEL), slice(0, start + PANEL))
         triangle.append(rows[:, :start], rows[:, start:].T)
     return DenseSubMin.restored(
         parts["ids"], parts["origins"], parts["adjustments"], triangle, float(attributes["chi_square"]), int(attributes["redundancy"]),

@@ -230,9 +230,7 @@ class Snapshot:
         else:
             session = repository.readonly_session(snapshot_id=find_version(place, version).snapshot)
         try:
-            # what Zarr would look for beside, an older format and metadata of all members in one place, is never there
-            root = zarr.open_group(session.store, mode="r", zarr_format=3, use_consolidated=False)
-            return cls(root, place, parameters=parameters)
+            return cls(_root(session), place, parameters=parameters)
         except FileNotFoundError:
             raise StoreError(f"{place}: holds a repository but no network; make one with 'submin create'") from None
 
@@ -365,6 +363,11 @@ def commit(session: icechunk.Session, version: int, message: str) -> None:
         ) from None
 
 
+def _root(session: icechunk.Session) -> zarr.Group:
+    """The root of a version. What Zarr would look for beside, an older format and metadata of all members in one place, is never there."""
+    return zarr.open_group(session.store, mode="r", zarr_format=3, use_consolidated=False)
+
+
 def begin_change(place: str, version: int) -> tuple[icechunk.Session, Snapshot]:
     """A session in which to write what follows a version, and that version, which what is written does not change.
 
@@ -372,11 +375,16 @@ def begin_change(place: str, version: int) -> tuple[icechunk.Session, Snapshot]:
     ------
     ConflictError
         When it is not the newest version any more: what was decided by its ledger may not hold.
+    StoreError
+        When its store is gone.
     """
     repository = _open_repository(place)
     session = repository.writable_session(BRANCH)
     base = repository.readonly_session(snapshot_id=session.snapshot_id)
-    snapshot = Snapshot(zarr.open_group(base.store, mode="r"), place)
+    try:
+        snapshot = Snapshot(_root(base), place)
+    except FileNotFoundError:  # it was there when the change was decided: what Zarr makes of a service that is gone
+        raise write_error(place, "the network's root is not found any more") from None
     if snapshot.number != version:
         raise ConflictError(
             f"another run committed to this network meanwhile (v{snapshot.number} after v{version}); nothing of this change was written: "

@@ -22,7 +22,17 @@ from submin.network.whitened_vectors import PASS, Vectors, WholeImages, vectors_
 from submin.query.kept import Kept
 from submin.query.outside import TileState, TreeState, other_priors
 from submin.query.source import NetworkSource
-from submin.storage.arrays import array_of, attributes_of, group_of, member_names, read_record, read_table, replace_table, write_record
+from submin.storage.arrays import (
+    PLAIN,
+    attributes_of,
+    group_of,
+    member_names,
+    read_matrix,
+    read_record,
+    read_table,
+    replace_table,
+    write_record,
+)
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_symmetric, write_symmetric
 from submin.tiling.tile_tree import TileTree
@@ -99,7 +109,7 @@ def write_elimination(root: zarr.Group, tree: str, node: int, done: Elimination)
     rows, columns = done.root.shape
     if columns:
         chunks = (min(rows, ROOT_CHUNK), min(columns, ROOT_CHUNK))
-        group.create_array("root", data=np.ascontiguousarray(done.root), chunks=chunks, compressors=None)
+        group.create_array("root", data=np.ascontiguousarray(done.root), chunks=chunks, compressors=PLAIN)
 
 
 def write_tile_state(root: zarr.Group, name: str, tree: str, node: int, vectors: Vectors, state: State) -> None:
@@ -131,7 +141,7 @@ def read_elimination(root: zarr.Group, tree: str, node: int) -> Elimination:
     group = group_of(root, f"{TREES}/{tree}n{node:05d}")
     parts = read_record(group)
     k, b = len(parts["interior"]), len(parts["boundary"])
-    values = np.asarray(array_of(group, "root")[:, :]) if k else np.empty((b, 0))
+    values = read_matrix(group, "root") if k else np.empty((b, 0))
     return Elimination(parts["interior"], parts["boundary"], np.asfortranarray(values), parts["shift"])
 
 

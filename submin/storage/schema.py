@@ -19,7 +19,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, widened
 from submin.network.network_image import JointPlace, NetworkImage
 from submin.network.sub_min import SubMin, wider
-from submin.storage.arrays import Record, array_of, attributes_of, group_of, read_record, write_record
+from submin.storage.arrays import PLAIN, Record, attributes_of, group_of, read_matrix, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
 FORMAT_VERSION = 6
@@ -165,15 +165,14 @@ def write_symmetric(group: zarr.Group, name: str, matrix: NDArray[np.float64]) -
     """Write a symmetric matrix as an array of square chunks, of which only those on and below the diagonal are written."""
     size = len(matrix)
     chunk = min(COVARIANCE_CHUNK, max(size, 1))
-    array = group.create_array(name, shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=None)
+    array = group.create_array(name, shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=PLAIN)
     for start in range(0, size, chunk):
         array[start : start + chunk, : start + chunk] = matrix[start : start + chunk, : start + chunk]
 
 
 def read_symmetric(group: zarr.Group, name: str, rows: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
     """A matrix of `write_symmetric`, both triangles: all of it, or some rows (ascending) and the same columns."""
-    array = array_of(group, name)
-    lower = np.asarray(array[:, :] if rows is None or len(rows) == array.shape[0] else array.oindex[rows, rows])
+    lower = read_matrix(group, name) if rows is None else read_matrix(group, name, rows, rows)
     return fill_symmetric(np.ascontiguousarray(lower))
 
 
@@ -229,7 +228,7 @@ def write_joint(root: zarr.Group, images: Sequence[NetworkImage]) -> None:
     for record, rows in parts.items():
         factor = np.concatenate(rows)
         chunks = tuple(min(JOINT_CHUNK, length) for length in factor.shape)
-        root.require_group(JOINT).create_group(record, overwrite=True).create_array("factor", data=factor, chunks=chunks)
+        root.require_group(JOINT).create_group(record, overwrite=True).create_array("factor", data=factor, chunks=chunks, compressors=PLAIN)
 
 
 def with_joint(root: zarr.Group, images: Sequence[NetworkImage]) -> list[NetworkImage]:
@@ -239,7 +238,7 @@ def with_joint(root: zarr.Group, images: Sequence[NetworkImage]) -> list[Network
     for record in {place.record for place in places if place is not None}:
         wanted = [place for place in places if place is not None and place.record == record]
         first, stop = min(place.first for place in wanted), max(place.first + place.rows for place in wanted)
-        factors[record] = first, np.asarray(array_of(group_of(root, f"{JOINT}/{record}"), "factor")[first:stop])
+        factors[record] = first, read_matrix(group_of(root, f"{JOINT}/{record}"), "factor", slice(first, stop))
     return [
         image if place is None else replace(image, joint=_rows_of(place, *factors[place.record]))
         for image, place in zip(images, places, strict=True)

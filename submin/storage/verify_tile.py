@@ -22,7 +22,7 @@ from submin.network.replay import joined, replay_error
 from submin.network.sub_min import SubMin, add_sums, factor, wider
 from submin.network.variance_factor import Fits, Kind, fits
 from submin.query.planner import DETERMINED_METRES
-from submin.storage.arrays import array_of, attributes_of, group_of, hash_ids, read_record
+from submin.storage.arrays import attributes_of, group_of, hash_ids, read_matrix, read_record
 from submin.storage.network_store import Snapshot
 from submin.storage.problems import DAMAGE, Problem, first_line, some
 from submin.storage.schema import determined, read_cell
@@ -319,7 +319,7 @@ def _cell_name(cover: Cover, number: int) -> str:
 def _read_sub_min(group: zarr.Group) -> tuple[SubMin, Array, list[int]]:
     """A sub-MIN, its covariance as it is stored (blocks above the diagonal zero), and the cells that it counts."""
     parts, attributes = read_record(group, ["images", "theta", "cells"]), attributes_of(group)
-    raw = np.asarray(array_of(group, "covariance")[:, :])
+    raw = read_matrix(group, "covariance")
     full = np.tril(raw)
     full += np.tril(raw, -1).T
     sub_min = SubMin(parts["images"].astype(np.int32), parts["theta"], full, float(attributes["chi_square"]), int(attributes["redundancy"]))

@@ -26,7 +26,17 @@ from submin.errors import StoreError
 from submin.network.cell import summed
 from submin.network.network_image import image_set
 from submin.simulation.region import SimulatedRegion
-from submin.storage.arrays import append_table, array_of, attributes_of, group_of, read_record, read_table, set_rows, write_record
+from submin.storage.arrays import (
+    append_table,
+    array_of,
+    attributes_of,
+    group_of,
+    read_matrix,
+    read_record,
+    read_table,
+    set_rows,
+    write_record,
+)
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import PointTable
 from submin.storage.network_store import Snapshot, begin_change, commit
@@ -332,7 +342,7 @@ def test_a_cover_that_cannot_be_understood(base: Path) -> None:
     assert pairs(verify(str(base), HERE)) == {("metadata", "")}
 
 
-@pytest.mark.parametrize("how", ["gone", "cut", "other"])
+@pytest.mark.parametrize("how", ["gone", "cut", "other", "one bit"])
 def test_a_chunk_that_is_lost_or_other_is_found(how: str, base: Path) -> None:
     """Files of the store itself: whatever was in them, there is a finding and no crash."""
     chunks = sorted(path for path in (base / "chunks").rglob("*") if path.is_file())
@@ -341,13 +351,35 @@ def test_a_chunk_that_is_lost_or_other_is_found(how: str, base: Path) -> None:
         middle = len(kept) // 2
         if how == "gone":
             path.unlink()
+        elif how == "cut":
+            path.write_bytes(kept[:middle])
         else:
-            turned = bytes(255 - byte for byte in kept[middle : middle + 8])
-            path.write_bytes(kept[:middle] + (b"" if how == "cut" else turned + kept[middle + 8 :]))
+            mask = [255] * 8 if how == "other" else [4]
+            turned = bytes(byte ^ flip for byte, flip in zip(kept[middle:], mask, strict=False))
+            path.write_bytes(kept[:middle] + turned + kept[middle + len(turned) :])
         found = verify(str(base), HERE)
         path.write_bytes(kept)
-        assert not found.ok
+        assert not found.ok, path.name
     assert verify(str(base), HERE).ok
+
+
+def test_what_was_damaged_is_never_read_as_a_number(base: Path) -> None:
+    """Cells and covariances are under a checksum: with one bit turned, reading them raises one line and gives nothing."""
+    snapshot = Snapshot.open(str(base))
+    cell = group_of(snapshot.root, "cells/" + snapshot.cover.cell_name(snapshot.cell_numbers()[0]))
+    tile = group_of(snapshot.root, "tiles/" + snapshot.cover.tile_name(snapshot.tile_numbers()[0]))
+    readers = (lambda: read_record(cell), lambda: read_matrix(tile, "covariance"))
+    raised = set()
+    for path in sorted(path for path in (base / "chunks").rglob("*") if path.is_file()):
+        kept = path.read_bytes()
+        path.write_bytes(kept[:40] + bytes([kept[40] ^ 1]) + kept[41:])
+        for number, read in enumerate(readers):
+            try:
+                read()
+            except StoreError as error:
+                raised.add((number, "damaged chunk in" in str(error)))
+        path.write_bytes(kept)
+    assert raised == {(0, True), (1, True)}
 
 
 def test_a_sound_network_is_sound_whatever_happens_to_it(region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path) -> None:
