@@ -18,6 +18,7 @@ from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import KilledTaskError
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic
 from submin.network.innovation import REJECTED, BlockTest
+from submin.network.network_image import NetworkImage
 from submin.network.registration import LooseRays, together
 from submin.storage.block_images import network_images
 from submin.storage.catalogue_schema import Block
@@ -26,6 +27,8 @@ from submin.storage.control_blocks import points_of
 from submin.storage.ledger import UNTESTED, Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 from submin.tiling.cover import Cover
+
+ImagesOf = Mapping[str, tuple[NetworkImage, ...]]
 
 BLOCKS_A_TASK = 8
 LEAST_AGREEING = 0.5
@@ -81,12 +84,13 @@ class BatchResult:
 
 def fuse_batch(
     where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter,
-    innovation: float = REJECTED, check_points: NDArray[np.str_] | None = None,
+    images: ImagesOf, innovation: float = REJECTED, check_points: NDArray[np.str_] | None = None,
 ) -> BatchResult:  # fmt: skip
     """Fuse blocks that the ledger of a version has let through; ``rejected`` ones are entered in the ledger in the same commit.
 
-    So are the ids of ``check_points``, where blocks are fused. A block that contradicts that version as a whole is rejected when one of
-    fewer than ``innovation`` good blocks would (0: none is).
+    ``images`` are those of the blocks, by block, as the network will have them. In the same commit go the ids of ``check_points``, where
+    blocks are fused. A block that contradicts that version as a whole is rejected when one of fewer than ``innovation`` good blocks would
+    (0: none is).
 
     Raises
     ------
@@ -95,9 +99,9 @@ def fuse_batch(
     """
     session, base = begin_change(where, version)
     refused = list(rejected)
-    accepted, tests = _stage_one(blocks, base, executor, reporter, refused)
+    accepted, tests = _stage_one(blocks, images, base, executor, reporter, refused)
     against = {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
-    blocks, move = _register([block for block in blocks if block.block_id in accepted], accepted, against, base, refused, executor)
+    blocks, move = _register([block for block in blocks if block.block_id in accepted], images, accepted, against, base, refused, executor)
     ledger = Ledger.of(base)
     unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
     if not blocks and not unsaid:
@@ -132,7 +136,7 @@ def fuse_batch(
 
 
 def _stage_one(
-    blocks: Sequence[Block], base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected]
+    blocks: Sequence[Block], images: ImagesOf, base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected]
 ) -> tuple[dict[str, NDArray[np.bool_]], dict[str, BlockTest]]:
     """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of surveyed points.
 
@@ -141,7 +145,10 @@ def _stage_one(
     of_images = [block for block in blocks if block.kind == "images"]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
     gates = _gates(groups, base)
-    arguments = [([block_rays(b) for b in group], base.metadata.ellipsoid, gate) for group, gate in zip(groups, gates, strict=True)]
+    arguments = [
+        ([block_rays(b, images[b.block_id]) for b in group], base.metadata.ellipsoid, gate)
+        for group, gate in zip(groups, gates, strict=True)
+    ]
     outcomes = executor.attempt_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
     for k, outcome in enumerate(outcomes):
         if isinstance(outcome, KilledTaskError):
@@ -203,6 +210,7 @@ def disagreement(accepted: NDArray[np.bool_]) -> str | None:
 
 def _register(
     blocks: list[Block],
+    images: ImagesOf,
     accepted: dict[str, NDArray[np.bool_]],
     against: Mapping[str, str],
     base: Snapshot,
@@ -217,7 +225,7 @@ def _register(
         rays = _arriving(blocks, accepted, base.image_count())
         move = place(
             base, take_points(base, rays.ids), rays,
-            [image for block in blocks for image in network_images(block)], executor,
+            [image for block in blocks for image in images[block.block_id]], executor,
         )  # fmt: skip
         bad = _misplaced(blocks, rays, move) or {k: against[b.block_id] for k, b in enumerate(blocks) if b.block_id in against}
         if not bad:
@@ -263,9 +271,11 @@ def _registered_at(ids: NDArray[np.str_], move: Move) -> NDArray[np.float64]:
     return geocentric_to_geodetic(origin, move.cover.ellipsoid)[:, :2]
 
 
-def block_rays(block: Block) -> BlockRays:
-    """A block of a catalogue as stage 1 sees it."""
-    return BlockRays(block.block_id, network_images(block), *block.points, block.image, block.observed, block.sigma)
+def block_rays(block: Block, images: tuple[NetworkImage, ...] | None = None) -> BlockRays:
+    """A block of a catalogue as stage 1 sees it; ``images`` where they are known already, as the network will have them."""
+    return BlockRays(
+        block.block_id, network_images(block) if images is None else images, *block.points, block.image, block.observed, block.sigma
+    )
 
 
 def _arriving(blocks: Sequence[Block], accepted: dict[str, NDArray[np.bool_]], first_image: int) -> LooseRays:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
-from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, register_part, update_tile
+from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, locate_part, update_tile
 from submin.adjustment.images import ImageSet
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.network.id_numbers import numbered
@@ -24,6 +24,7 @@ from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import (
     LooseRays,
     Registration,
+    arranged,
     by_points,
     contradictions,
     joined,
@@ -171,8 +172,8 @@ def _registered(rays: LooseRays, images: ImageSet, rows: Index, cover: Cover, ex
     if len(parts) == 1:
         return register(rays, images, rows, cover)
     known = executor.share((images, rows, replace(cover)))  # without what the cover has worked out: it travels
-    handles = executor.submit_all(register_part, [(rays.take(part), known) for part in parts], "register", lambda: None)
-    return joined(executor.results(handles), parts)
+    handles = executor.submit_all(locate_part, [(rays.take(part), known) for part in parts], "register", lambda: None)
+    return arranged(rays, joined(executor.results(handles), parts))
 
 
 def _touched_tiles(cover: Cover, out: TakenOut, registration: Registration) -> list[int]:
@@ -279,29 +280,24 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
 
 def _origins(move: Move) -> dict[int, tuple[int, ...]]:
     """For each cell at which points arrive from other cells that are still there: these cells."""
-    coming, going = _by_cell({c: points.point_ids for c, points in move.registration.arrivals.items()}), _by_cell(move.out.departures)
-    ids, place = numbered(np.concatenate([going.ids, coming.ids]))
-    cell_before = np.full(len(ids), -1, dtype=np.int64)
-    cell_before[place[: len(going.ids)]] = going.cell
-    left = cell_before[place[len(going.ids) :]]
-    moved = (left >= 0) & (left != coming.cell)
+    before, after = _departures(move)
+    moved = (after >= 0) & (after != before)
     found: dict[int, tuple[int, ...]] = {}
-    for to, origin in np.unique(np.column_stack([coming.cell[moved], left[moved]]), axis=0).tolist():
+    for to, origin in np.unique(np.column_stack([after[moved], before[moved]]), axis=0).tolist():
         found[to] = (*found.get(to, ()), origin)
     return found
 
 
-@dataclass(frozen=True)
-class _InCells:
-    """Ids (n,) of points, and the cell (n,) of each."""
-
-    ids: Ids
-    cell: NDArray[np.int64]
-
-
-def _by_cell(points: Mapping[int, Ids]) -> _InCells:
-    cells = np.repeat(np.array(list(points), dtype=np.int64), [len(ids) for ids in points.values()])
-    return _InCells(np.concatenate([np.empty(0, dtype="U1"), *points.values()]), cells)
+def _departures(move: Move) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The cell (n,) that each point which was taken out has left, and the one (n,) to which it goes; -1 where it goes nowhere."""
+    out, (ids, at) = move.out.departures, move.registration.directory
+    left = np.repeat(np.array(list(out), dtype=np.int64), [len(of_cell) for of_cell in out.values()])
+    if not len(left):
+        return left, left
+    known, place = numbered(np.concatenate([ids, *out.values()]))
+    goes = np.full(len(known), -1, dtype=np.int64)
+    goes[place[: len(ids)]] = at
+    return left, goes[place[len(ids) :]]
 
 
 def _changes(base: Snapshot, move: Move, reports: Sequence[TileReport], origins: Mapping[int, Sequence[int]]) -> Changes:
@@ -312,12 +308,8 @@ def _changes(base: Snapshot, move: Move, reports: Sequence[TileReport], origins:
     cover = move.cover
     lost = {report.tile for report in reports if report.lost}
     lost |= {base.cover.owner(c) for c in base.cell_numbers() if base.cover.cell_name(c) in move.out.dissolved}
-    ids, cells = move.registration.directory
-    placed, going = ids[cells >= 0], _by_cell(move.out.departures)
-    known, number = numbered(np.concatenate([placed, going.ids]))
-    stays = np.zeros(len(known), dtype=np.bool_)
-    stays[number[: len(placed)]] = True
-    lost |= {cover.owner(c) for c in np.unique(going.cell[~stays[number[len(placed) :]]]).tolist()}
+    before, after = _departures(move)
+    lost |= {cover.owner(c) for c in np.unique(before[after < 0]).tolist()}
     if any(report.lost_elsewhere for report in reports):
         lost.add(EVERYWHERE)
     stale = {tile for to, cells in origins.items() for c in cells for tile in set(cover.holders(to)) - set(cover.holders(c))}

@@ -14,7 +14,7 @@ from submin.adjustment.adjustment import adjust
 from submin.adjustment.elimination import eliminate, linearise, point_factors
 from submin.adjustment.estimation import estimate_images
 from submin.adjustment.intersection import intersect
-from submin.adjustment.rays import Rays
+from submin.adjustment.rays import Rays, canonical_order
 from submin.errors import InputError, NumericalError
 from submin.geodesy import Ellipsoid, geodetic_to_geocentric, local_axes
 from submin.network.network_image import image_set
@@ -69,7 +69,7 @@ def free_points(block: Block, ellipsoid: Ellipsoid) -> Member:
     used = outcome.accepted
     seen, point = np.unique(raw.point[used], return_inverse=True)
     ids = raw.ids[seen]
-    order = np.lexsort((raw.observed[used][:, 1], raw.observed[used][:, 0], raw.image[used], point))
+    order = canonical_order(point, raw.image[used], raw.observed[used])
     rays = Rays(
         point[order].astype(np.int32), raw.image[used][order], raw.observed[used][order], raw.sigma[used][order],
         np.ones(len(order), dtype=np.bool_),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from orchestration.tasks import FlaggedImage
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import InputError
 from submin.network.innovation import REJECTED
+from submin.network.network_image import NetworkImage
+from submin.storage.block_images import images_of_blocks
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, observed_positions, points_of
@@ -29,6 +31,8 @@ from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import writing
 
 DEFAULT_BATCH_BLOCKS = 2000
+BLOCKS_TOGETHER = 64
+"""Blocks whose images are worked out together while they are read."""
 
 
 @dataclass(frozen=True)
@@ -194,13 +198,14 @@ def fuse_blocks(
         When one has written to it since the ledger was read, where there is no lock to keep it out.
     """
     with writing(place):
-        known = Snapshot.open(place)
-        tally = Tally(known.number, {row for _, row in known.flags()})
-        new = _new_blocks(blocks, Ledger.of(known), tally, reporter)
-        for batch in batches_ahead(new, max(batch_blocks, 1)):
-            good = [block for block, reason in batch if reason is None]
-            refused = [Rejected.of(block, reason) for block, reason in batch if reason is not None]
-            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, innovation, check_points))
+        before = Snapshot.open(place)
+        tally = Tally(before.number, {row for _, row in before.flags()})
+        new = _new_blocks(blocks, Ledger.of(before), tally, reporter)
+        for batch in batches_ahead(_with_images(new), max(batch_blocks, 1)):
+            good = [known.block for known in batch if known.reason is None]
+            refused = [Rejected.of(known.block, known.reason) for known in batch if known.reason is not None]
+            images = {known.block.block_id: known.images for known in batch}
+            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points))
             reporter.fused(len(batch))
             give_back()
     return tally
@@ -231,6 +236,23 @@ def _new_blocks(blocks: Iterable[Block], ledger: Ledger, tally: Tally, reporter:
         if reason is None:
             ledger.enter(block)
         yield block, reason
+
+
+@dataclass(frozen=True)
+class _Incoming:
+    """A block that the network does not have: why it cannot come in, if so, and its images as the network will have them, if not."""
+
+    block: Block
+    reason: str | None
+    images: tuple[NetworkImage, ...]
+
+
+def _with_images(new: Iterable[tuple[Block, str | None]]) -> Iterator[_Incoming]:
+    """New blocks with their images, which are worked out for some blocks together."""
+    left = iter(new)
+    while group := list(islice(left, BLOCKS_TOGETHER)):
+        images = iter(images_of_blocks([block for block, reason in group if reason is None]))
+        yield from (_Incoming(block, reason, next(images) if reason is None else ()) for block, reason in group)
 
 
 def check_frames(catalogue: Catalogue, snapshot: Snapshot) -> None:

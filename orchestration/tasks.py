@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from submin.adjustment.adjustment import Adjustment, adjust
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import blind_image, intersect
-from submin.adjustment.rays import Rays
+from submin.adjustment.rays import Rays, canonical_order
 from submin.adjustment.status import Cause, Status
 from submin.adjustment.surveyed_points import ContradictedPoint, contradicted_points
 from submin.errors import NumericalError, SubminError
@@ -24,7 +24,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, loses, summed, union_of_images, with_points, without_points
 from submin.network.innovation import BlockTest
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.registration import LooseRays, Registration, register
+from submin.network.registration import Located, LooseRays, locate
 from submin.network.sub_min import SubMin, add_sums, factor
 from submin.query.block_innovation import block_test, common_points
 from submin.sensors import sensor_named, width_of
@@ -143,7 +143,7 @@ def adjust_block(
     try:
         images = image_set(block.images, ellipsoid, width_of(image.sensor for image in block.images))
         ids, point = block.ids, block.point
-        order = np.lexsort((block.observed[:, 1], block.observed[:, 0], block.image, point))
+        order = canonical_order(point, block.image, block.observed)
         rays = Rays(point[order], block.image[order], block.observed[order], block.sigma[order], accepted)
         start = intersect(images, rays, len(ids))
         lost = np.flatnonzero(~np.isfinite(start).all(axis=1))
@@ -219,9 +219,9 @@ class BlockGate:
         return rows[np.isin(self._passes[rows], [image.pass_id for image in block])]
 
 
-def register_part(rays: LooseRays, known: tuple[ImageSet, NDArray[np.int32], Cover]) -> Registration:
-    """`register` with images, their rows and a cover that all parts of the rays share."""
-    return register(rays, *known)
+def locate_part(rays: LooseRays, known: tuple[ImageSet, NDArray[np.int32], Cover]) -> Located:
+    """`locate` with images, their rows and a cover that all parts of the rays share."""
+    return locate(rays, *known)
 
 
 def update_tile(

@@ -46,9 +46,21 @@ class Rays:
         return Rays(self.point[rows], self.image[rows], self.observed[rows], self.sigma[rows], self.accepted[rows])
 
 
+def canonical_order(point: NDArray[np.integer], image: NDArray[np.integer], observed: Array) -> NDArray[np.int64]:
+    """Order (r,) of rays by point, then image, then the columns of what was observed (r, c): that of ``lexsort``, which sorts by each."""
+    key = (point.astype(np.int64) << 32) | image
+    if bool((key[1:] > key[:-1]).all()):
+        return np.arange(len(key))
+    order = np.argsort(key)
+    key = key[order]
+    if bool((key[1:] > key[:-1]).all()):
+        return order
+    return np.lexsort((*observed.T[::-1], image, point))  # a point measured twice in one image
+
+
 def sorted_rays(point: Index, image: Index, observed: Array, sigma: Array, accepted: NDArray[np.bool_]) -> Rays:
     """Rays in canonical order: by point, then image. The order of arrival leaves no trace in later sums."""
-    order = np.lexsort((observed[:, 1], observed[:, 0], image, point))
+    order = canonical_order(point, image, observed)
     return Rays(
         np.ascontiguousarray(point[order], dtype=np.int32),
         np.ascontiguousarray(image[order], dtype=np.int32),

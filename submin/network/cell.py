@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from submin.adjustment.elimination import LinearRays, PointFactors, Sums, eliminate, linearise, point_factors
 from submin.adjustment.images import ImageSet
-from submin.adjustment.rays import Rays, sorted_rays
+from submin.adjustment.rays import Rays, canonical_order, sorted_rays
 from submin.adjustment.symmetric import permuted
 from submin.errors import InputError
 
@@ -254,7 +254,7 @@ def bundle(cells: Sequence[Cell], images: Index) -> Bundle:
     point = np.concatenate([cell.rays.point + shift for cell, shift in zip(cells, shifts, strict=False)]).astype(np.int32)
     image = np.concatenate([place[np.searchsorted(images, cell.images, sorter=place)][cell.rays.image] for cell in cells]).astype(np.int32)
     observed = np.concatenate([cell.rays.observed for cell in cells])
-    row = np.lexsort((observed[:, 1], observed[:, 0], image, point))
+    row = canonical_order(point, image, observed)
     sigma = np.concatenate([cell.rays.sigma for cell in cells])
     rays = Rays(point[row], image[row], observed[row], sigma[row], np.ones(len(row), dtype=np.bool_))
     return Bundle(rays, np.concatenate([cell.origin for cell in cells]), row)

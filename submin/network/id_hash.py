@@ -12,12 +12,17 @@ def hash_ids(ids: NDArray[np.str_]) -> NDArray[np.uint64]:
     """64-bit FNV-1a hash (n,) of the UTF-8 bytes of each id (Fowler, Noll, Vo)."""
     if not len(ids):
         return np.empty(0, dtype=np.uint64)
-    encoded = np.char.encode(ids, "utf-8")
-    width = max(encoded.dtype.itemsize, 1)
-    matrix = encoded.astype(f"S{width}").view(np.uint8).reshape(len(ids), width)
-    lengths = np.char.str_len(encoded)
+    letters, lengths = _letters(ids)
     value = np.full(len(ids), _FNV_OFFSET)
-    for k in range(width):  # over the letters of the longest id, all ids at once
-        live = lengths > k
-        value[live] = (value[live] ^ matrix[live, k].astype(np.uint64)) * _FNV_PRIME
+    for k in range(letters.shape[1]):  # over the letters of the longest id, all ids at once
+        value = np.where(lengths > k, (value ^ letters[:, k]) * _FNV_PRIME, value)
     return value
+
+
+def _letters(ids: NDArray[np.str_]) -> tuple[NDArray[np.unsignedinteger], NDArray[np.integer]]:
+    """UTF-8 bytes (n, longest) of each id, and their number (n,)."""
+    points = np.ascontiguousarray(ids).view(np.uint32).reshape(len(ids), -1)
+    if points.max(initial=0) < 128:  # letters that are one byte each
+        return points, np.char.str_len(ids)
+    encoded = np.char.encode(ids, "utf-8")
+    return encoded.view(np.uint8).reshape(len(ids), -1), np.char.str_len(encoded)

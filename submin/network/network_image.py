@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from submin.geodesy import WGS84, Ellipsoid
 from submin.sensors import sensor_named
 from submin.sensors.footprint import ground_pixels
 from submin.sensors.rpc import image_centres
+
+CAMERAS_KEPT = 8192
+"""Parsed cameras that a process keeps: those of a batch."""
 
 
 @dataclass(frozen=True)
@@ -74,37 +78,66 @@ class JointPlace:
 _JOINT = "joint"
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=CAMERAS_KEPT)
 def _packed(sensor: str, camera: str, width: int, height: int) -> NDArray[np.float64]:
     return sensor_named(sensor).pack(json.loads(camera), width, height)
 
 
-def a_priori_text(a_priori: APriori | None, image_id: str, sensor: str, camera: str, width: int, height: int) -> str:
-    """What an image has in ``a_priori``: its block's model, in the image's own pixels where that states the shift of RPCs in metres.
+class CatalogueImage(Protocol):
+    """What a catalogue says of the camera of an image."""
+
+    @property
+    def image_id(self) -> str:
+        """Name of the image."""
+
+    @property
+    def sensor(self) -> str:
+        """Name of its sensor model."""
+
+    @property
+    def camera(self) -> str:
+        """Description of its camera, JSON text."""
+
+    @property
+    def width(self) -> int:
+        """Samples."""
+
+    @property
+    def height(self) -> int:
+        """Lines."""
+
+
+def a_priori_texts(models: Sequence[APriori | None], images: Sequence[CatalogueImage]) -> list[str]:
+    """What images have in ``a_priori``: the model of each one's block, in its own pixels where that states the shift of RPCs in metres.
 
     Raises
     ------
     InputError
-        When the camera is not what its sensor model expects, or does not see the ground in the middle of the image.
+        When a camera is not what its sensor model expects, or does not see the ground in the middle of its image.
     """
-    if a_priori is None:
-        return ""
-    if a_priori.bias_m is not None and sensor == "rpc":
-        pixel = _ground_pixel(camera, width, height)
-        if not np.isfinite(pixel):
+    in_metres = [k for k, model in enumerate(models) if model is not None and model.bias_m is not None and images[k].sensor == "rpc"]
+    pixel = dict(zip(in_metres, _ground_pixels([images[k] for k in in_metres]), strict=True))
+    for k in in_metres:
+        if not np.isfinite(pixel[k]):
             raise InputError(
-                f"image {image_id}: its camera does not see the ground in the middle of the image, so a shift stated in metres (bias_m of "
-                "the priors) has no size in pixels; mend the camera, or state bias_px"
+                f"image {images[k].image_id}: its camera does not see the ground in the middle of the image, so a shift stated in metres "
+                "(bias_m of the priors) has no size in pixels; mend the camera, or state bias_px"
             )
-        a_priori = a_priori.in_pixels(pixel)
-    return json.dumps(a_priori.to_mapping(), sort_keys=True)
+    return ["" if model is None else _text(model.in_pixels(pixel[k]) if k in pixel else model) for k, model in enumerate(models)]
+
+
+def _ground_pixels(images: Sequence[CatalogueImage]) -> list[float]:
+    """Size of a pixel of each of some RPC images (whose ground is on WGS84) in its middle, metres; NaN where it sees no ground."""
+    if not images:
+        return []
+    cameras = np.array([_packed(i.sensor, i.camera, i.width, i.height) for i in images])
+    found: list[float] = ground_pixels(sensor_named("rpc"), cameras, image_centres(cameras), WGS84).tolist()
+    return found
 
 
 @lru_cache(maxsize=4096)
-def _ground_pixel(camera: str, width: int, height: int) -> float:
-    """Size of a pixel of an RPC image (whose ground is on WGS84) in its middle, metres; NaN where it sees no ground."""
-    packed = _packed("rpc", camera, width, height)[None]
-    return float(ground_pixels(sensor_named("rpc"), packed, image_centres(packed), WGS84)[0])
+def _text(model: APriori) -> str:
+    return json.dumps(model.to_mapping(), sort_keys=True)
 
 
 @lru_cache(maxsize=256)

@@ -70,8 +70,15 @@ class LooseRays:
 
     def take(self, rows: Flags | NDArray[np.int64]) -> LooseRays:
         """The rays of these rows, or where ``rows`` (r,) is True."""
-        points, point = np.unique(self.point[rows], return_inverse=True)
-        return LooseRays(self.ids[points], point.astype(np.int32), *(getattr(self, name)[rows] for name in _OF_RAYS))
+        points, point = _compact(self.point[rows], len(self.ids))
+        return LooseRays(self.ids[points], point, *(getattr(self, name)[rows] for name in _OF_RAYS))
+
+
+def _compact(point: NDArray[np.int32], points: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Those (n,) of some points that rays have, ascending, and the place (r,) of each ray's point among them."""
+    seen = np.zeros(points, dtype=np.bool_)
+    seen[point] = True
+    return np.flatnonzero(seen), (np.cumsum(seen, dtype=np.int32) - 1)[point]
 
 
 _OF_RAYS = tuple(field.name for field in fields(LooseRays))[2:]
@@ -90,10 +97,10 @@ def together(parts: Sequence[LooseRays]) -> LooseRays:
 def taken_out(cell: Cell, points: Flags) -> LooseRays:
     """The rays of those of a cell's points where ``points`` (n,) is True."""
     rays = cell.rays.take(points[cell.rays.point])
-    seen, point = np.unique(rays.point, return_inverse=True)
+    seen, point = _compact(rays.point, len(cell))
     block = np.full(len(rays), IN_THE_NETWORK, dtype=np.int32)
     return LooseRays(
-        cell.point_ids[seen], point.astype(np.int32), cell.images[rays.image], rays.observed, rays.sigma, rays.accepted, block
+        cell.point_ids[seen], point, cell.images[rays.image], rays.observed, rays.sigma, rays.accepted, block
     )  # fmt: skip
 
 
@@ -115,14 +122,36 @@ class Registration:
     outside: Flags
 
 
+@dataclass(frozen=True)
+class Located:
+    """Where points are registered.
+
+    Attributes
+    ----------
+    origin : (n, 3) geocentric metres, NaN where a camera reaches no ground; cell : (n,) number, -1 there
+    outside : (n,) True for points outside the cover's rectangle; passing : (r, 3) of their rays, see `Registration`
+    """
+
+    origin: Array
+    cell: NDArray[np.int64]
+    outside: Flags
+    passing: Array
+
+
 def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cover: Cover) -> Registration:
     """Register the points of some rays, which are all rays that these points have.
 
     ``images`` are at least those of the rays, ``image_rows`` their rows in the network, ascending.
     """
-    ids, point = rays.ids, rays.point
+    return arranged(rays, locate(rays, images, image_rows, cover))
+
+
+def locate(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cover: Cover) -> Located:
+    """Where the points of some rays are registered; arguments as of `register`. Each point depends on its own rays alone."""
+    point, points = rays.point, len(rays.ids)
+    at, outside = np.full(points, -1, dtype=np.int64), np.zeros(points, dtype=np.bool_)
     if not len(rays):
-        return Registration({}, (ids, np.empty(0, dtype=np.int64)), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
+        return Located(np.empty((0, 3)), at, outside, np.empty((0, 3)))
     named = np.argsort(np.array(images.ids, dtype=np.str_))
     rank = np.empty(len(named), dtype=np.int32)
     rank[named] = np.arange(len(named))
@@ -130,10 +159,8 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     local = rank[np.searchsorted(image_rows, rays.image)]
 
     every = np.ones(len(rays), dtype=np.bool_)
-    origin = intersect(images, sorted_rays(point, local, rays.observed, rays.sigma, every), len(ids))
+    origin = intersect(images, sorted_rays(point, local, rays.observed, rays.sigma, every), points)
     reached: Flags = np.asarray(np.isfinite(origin).all(axis=1))
-    at = np.full(len(ids), -1, dtype=np.int64)
-    outside: Flags = np.zeros(len(ids), dtype=np.bool_)
     geodetic = geocentric_to_geodetic(origin[reached], cover.ellipsoid)
     at[reached] = cover.cells_of(geodetic[:, 0], geodetic[:, 1])
     outside[reached] = cover.outside(geodetic[:, 0], geodetic[:, 1])
@@ -141,47 +168,40 @@ def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], c
     passing = np.full((len(point), 3), np.inf)
     if usable.any():
         passing[usable] = _passing(images, local[usable], rays.observed[usable], compact[point[usable]], origin[reached])
+    return Located(origin, at, outside, passing)
 
+
+def arranged(rays: LooseRays, located: Located) -> Registration:
+    """Rays by the cells in which their points are registered."""
+    ids, point, at = rays.ids, rays.point, located.cell
+    cells, place = np.unique(at, return_inverse=True)
+    place = place[point]
+    order = np.argsort(place * len(point) + np.arange(len(point)))  # rays by cell: one pass however many cells
+    start = np.cumsum([0, *np.bincount(place, minlength=len(cells))])
     arrivals: dict[int, RegisteredPoints] = {}
-    order = np.lexsort((np.arange(len(point)), at[point]))  # rays by cell: one pass however many cells
-    cells, start = np.unique(at[point[order]], return_index=True)
-    for number, rows in zip(cells.tolist(), np.split(order, start[1:]), strict=True):
+    for k, number in enumerate(cells.tolist()):
         if number >= 0:
+            rows = order[start[k] : start[k + 1]]
             members, row = np.unique(point[rows], return_inverse=True)
             arrivals[number] = RegisteredPoints(
-                ids[members], origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
+                ids[members], located.origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
             )
-    return Registration(arrivals, (ids, at), passing, outside[point])
+    return Registration(arrivals, (ids, at), located.passing, located.outside[point])
 
 
 def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
-    """Rows of some rays in so many parts, each with all rays of its points: parts can be registered apart, see `joined`."""
+    """Rows of some rays in so many parts, each with all rays of its points: parts can be located apart, see `joined`."""
     part = (rays.point.astype(np.int64) * parts // max(len(rays.ids), 1)).astype(np.uint16)
     return np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part, minlength=parts))[:-1])
 
 
-def joined(parts: Sequence[Registration], rows: Sequence[NDArray[np.int64]]) -> Registration:
-    """The registration of all points from those of parts of their rays, whose rows are those of `by_points`."""
-    back = np.argsort(np.concatenate(rows))
-    arriving: dict[int, list[RegisteredPoints]] = {}
-    for part in parts:
-        for cell, points in part.arrivals.items():
-            arriving.setdefault(cell, []).append(points)
-    ids, cells = (np.concatenate([part.directory[k] for part in parts]) for k in range(2))
-    return Registration(
-        {cell: _one_after_another(arriving[cell]) for cell in sorted(arriving)},
-        (ids, cells),
-        np.concatenate([part.passing for part in parts])[back],
-        np.concatenate([part.outside for part in parts])[back],
-    )
-
-
-def _one_after_another(parts: Sequence[RegisteredPoints]) -> RegisteredPoints:
-    shifts = np.cumsum([0, *(len(part.point_ids) for part in parts)])
-    point = np.concatenate([part.point + shift for part, shift in zip(parts, shifts, strict=False)]).astype(np.int32)
-    names = ("point_ids", "origin", "image", "observed", "sigma")
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return RegisteredPoints(point=point, **columns)
+def joined(parts: Sequence[Located], rows: Sequence[NDArray[np.int64]]) -> Located:
+    """Where all points are registered, from parts of their rays, whose rows are those of `by_points`."""
+    passing = np.empty((sum(map(len, rows)), 3))
+    for part, of_part in zip(parts, rows, strict=True):
+        passing[of_part] = part.passing
+    origin, cell, outside = (np.concatenate([getattr(part, name) for part in parts]) for name in ("origin", "cell", "outside"))
+    return Located(origin, cell, outside, passing)
 
 
 def _passing(images: ImageSet, image: NDArray[np.int32], observed: Array, point: NDArray[np.int64], origin: Array) -> Array:

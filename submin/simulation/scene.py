@@ -21,7 +21,7 @@ from submin.accuracy import ce90, le90
 from submin.adjustment.images import ImageSet
 from submin.adjustment.priors import APriori
 from submin.geodesy import WGS84, Ellipsoid, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
-from submin.network.network_image import NetworkImage, a_priori_text, image_set
+from submin.network.network_image import NetworkImage, a_priori_texts, image_set
 from submin.sensors import width_of
 
 Array = NDArray[np.float64]
@@ -52,13 +52,11 @@ class SimulatedImage:
 
 def simulated_image_set(images: Sequence[SimulatedImage], priors: Mapping[str, APriori], ellipsoid: Ellipsoid = WGS84) -> ImageSet:
     """Images with their cameras and a priori models (by block), read back from the text that a catalogue would hold."""
+    texts = a_priori_texts([priors[image.block_id] for image in images], images)
     members = [
-        NetworkImage(
-            i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds,
-            a_priori_text(priors[i.block_id], i.image_id, i.sensor, i.camera, i.width, i.height),
-        )
-        for i in images
-    ]  # fmt: skip
+        NetworkImage(i.image_id, i.block_id, i.pass_id, i.sensor, i.camera, i.width, i.height, i.seconds, text)
+        for i, text in zip(images, texts, strict=True)
+    ]
     return image_set(members, ellipsoid, width_of(image.sensor for image in images))
 
 

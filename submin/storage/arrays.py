@@ -15,6 +15,7 @@ import pyarrow as pa
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.core.array_spec import ArrayConfigLike
 from zarr.core.sync import sync
 
 from submin.errors import StoreError
@@ -33,6 +34,8 @@ TABLE_CHUNK = 1 << 16
 """Rows of a chunk of a table."""
 PLAIN = (Crc32cCodec(),)
 """Chunks as they are, each with a checksum: numbers do not compress, and what was damaged must not be read as another number."""
+WRITTEN_WHOLE: ArrayConfigLike = {"write_empty_chunks": True}
+"""Chunks are not searched for a value other than zero before they are written: there always is one."""
 PACKED = (ZstdCodec(level=0), Crc32cCodec())
 """Compressed chunks, each with a checksum: of tables."""
 
@@ -129,7 +132,7 @@ def write_record(parent: zarr.Group, name: str, parts: Mapping[str, AnyArray], a
     # attributes at creation: each later change of one costs as much as an array
     group = parent.create_group(name, overwrite=True, attributes={"layout": layout, **(attributes or {})})
     if size:
-        group.create_array("data", data=np.concatenate(pieces), chunks=(min(RECORD_CHUNK, size),), compressors=PLAIN)
+        group.create_array("data", data=np.concatenate(pieces), chunks=(min(RECORD_CHUNK, size),), compressors=PLAIN, config=WRITTEN_WHOLE)
     return group
 
 

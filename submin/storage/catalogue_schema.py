@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from submin.adjustment.joint_errors import JointErrors
 from submin.adjustment.priors import APriori
+from submin.adjustment.rays import canonical_order
 from submin.errors import CatalogueError, InputError
 from submin.geodesy import WGS84, Ellipsoid
 from submin.network.id_numbers import numbered
@@ -312,7 +313,7 @@ class Block:
         rank[order] = np.arange(len(order))
         points, point = self.points
         measured = [np.asarray(getattr(self, name), dtype="<f8") + 0.0 for name in _MEASURED]  # + 0.0: one sign of zero
-        rays = np.lexsort((*measured[::-1], rank[self.image], point))
+        rays = canonical_order(point, rank[self.image], np.column_stack(measured))
         head = {
             "images": [self.images[i]._content for i in order],
             "a_priori": None if self.a_priori is None else self.a_priori.to_mapping(),

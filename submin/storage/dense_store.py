@@ -16,6 +16,7 @@ from submin.network.observations import Cluster
 from submin.network.triangle import PANEL, Triangle
 from submin.storage.arrays import (
     PLAIN,
+    WRITTEN_WHOLE,
     append_table,
     attributes_of,
     create_table,
@@ -148,7 +149,9 @@ def write_state(root: zarr.Group, state: DenseSubMin, inner: Mapping[str, tuple[
     )  # fmt: skip
     size = state.triangle.size
     chunk = min(COVARIANCE_CHUNK, max(size, 1))
-    array = record.create_array("covariance", shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=PLAIN)
+    array = record.create_array(
+        "covariance", shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=PLAIN, config=WRITTEN_WHOLE
+    )
     for k, panel in enumerate(state.triangle.panels):
         start, stop = k * PANEL, min((k + 1) * PANEL, size)
         array[start:stop, :stop] = panel[:stop, : stop - start].T  # a block column of the one triangle is a block row of the other

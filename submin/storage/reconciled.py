@@ -24,6 +24,7 @@ from submin.query.outside import TileState, TreeState, other_priors
 from submin.query.source import NetworkSource
 from submin.storage.arrays import (
     PLAIN,
+    WRITTEN_WHOLE,
     attributes_of,
     group_of,
     member_names,
@@ -109,7 +110,7 @@ def write_elimination(root: zarr.Group, tree: str, node: int, done: Elimination)
     rows, columns = done.root.shape
     if columns:
         chunks = (min(rows, ROOT_CHUNK), min(columns, ROOT_CHUNK))
-        group.create_array("root", data=np.ascontiguousarray(done.root), chunks=chunks, compressors=PLAIN)
+        group.create_array("root", data=np.ascontiguousarray(done.root), chunks=chunks, compressors=PLAIN, config=WRITTEN_WHOLE)
 
 
 def write_tile_state(root: zarr.Group, name: str, tree: str, node: int, vectors: Vectors, state: State) -> None:

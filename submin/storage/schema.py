@@ -19,7 +19,7 @@ from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, widened
 from submin.network.network_image import JointPlace, NetworkImage
 from submin.network.sub_min import SubMin, wider
-from submin.storage.arrays import PLAIN, Record, attributes_of, group_of, read_matrix, read_record, write_record
+from submin.storage.arrays import PLAIN, WRITTEN_WHOLE, Record, attributes_of, group_of, read_matrix, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
 FORMAT_VERSION = 6
@@ -165,7 +165,7 @@ def write_symmetric(group: zarr.Group, name: str, matrix: NDArray[np.float64]) -
     """Write a symmetric matrix as an array of square chunks, of which only those on and below the diagonal are written."""
     size = len(matrix)
     chunk = min(COVARIANCE_CHUNK, max(size, 1))
-    array = group.create_array(name, shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=PLAIN)
+    array = group.create_array(name, shape=(size, size), chunks=(chunk, chunk), dtype="float64", compressors=PLAIN, config=WRITTEN_WHOLE)
     for start in range(0, size, chunk):
         array[start : start + chunk, : start + chunk] = matrix[start : start + chunk, : start + chunk]
 
@@ -228,7 +228,9 @@ def write_joint(root: zarr.Group, images: Sequence[NetworkImage]) -> None:
     for record, rows in parts.items():
         factor = np.concatenate(rows)
         chunks = tuple(min(JOINT_CHUNK, length) for length in factor.shape)
-        root.require_group(JOINT).create_group(record, overwrite=True).create_array("factor", data=factor, chunks=chunks, compressors=PLAIN)
+        root.require_group(JOINT).create_group(record, overwrite=True).create_array(
+            "factor", data=factor, chunks=chunks, compressors=PLAIN, config=WRITTEN_WHOLE
+        )
 
 
 def with_joint(root: zarr.Group, images: Sequence[NetworkImage]) -> list[NetworkImage]:

@@ -26,9 +26,11 @@ from submin.network.registration import (
     SAME_POINT_METRES,
     LooseRays,
     Registration,
+    arranged,
     by_points,
     contradictions,
     joined,
+    locate,
     register,
     taken_out,
     together,
@@ -529,7 +531,7 @@ def test_parts_put_together_are_the_whole(seed: int, parts: int) -> None:
     whole = register(rays, IMAGES, ROWS, COVER)
     rows = by_points(rays, parts)
     assert sorted(np.concatenate(rows).tolist()) == list(range(len(rays)))
-    found = joined([register(rays.take(part), IMAGES, ROWS, COVER) for part in rows], rows)
+    found = arranged(rays, joined([locate(rays.take(part), IMAGES, ROWS, COVER) for part in rows], rows))
     for name in ("passing", "outside"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
     for k in range(2):
