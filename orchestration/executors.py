@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, Protocol, TypeVar
 
-from orchestration.memory import own_peak_memory_mb
+from orchestration.memory import give_back, own_peak_memory_mb
 from orchestration.task_record import TaskRecord, added, recorded, taken_notes
 from submin.adjustment.warm_up import compile_kernels
 from submin.errors import ClusterError, InputError, KilledTaskError
@@ -61,6 +61,10 @@ class Executor(Protocol):
         """The values of some handles."""
         ...
 
+    def give_back(self) -> None:
+        """Give memory that was freed back to the system, here and where tasks run: between two batches."""
+        ...
+
     def peak_memory_mb(self) -> float:
         """Largest resident memory so far, megabytes: this process and its workers together."""
         ...
@@ -107,6 +111,10 @@ class SerialExecutor:
     def results(self, handles: Sequence[Any]) -> list[Any]:
         """See `Executor.results`."""
         return list(handles)
+
+    def give_back(self) -> None:
+        """See `Executor.give_back`."""
+        give_back()
 
     def peak_memory_mb(self) -> float:
         """See `Executor.peak_memory_mb`."""
@@ -236,6 +244,13 @@ class DaskExecutor:
         """See `Executor.results`."""
         with self._losses_said():
             return list(self.client.gather(list(handles)))
+
+    def give_back(self) -> None:
+        """See `Executor.give_back`."""
+        give_back()
+        with self._losses_said():
+            self._check_scheduler()
+            self.client.run(give_back, on_error="ignore")
 
     def peak_memory_mb(self) -> float:
         """See `Executor.peak_memory_mb`."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
-from orchestration.memory import give_back
 from orchestration.progress import Reporter, Silent
 from orchestration.read_ahead import batches_ahead
 from orchestration.task_record import TaskRecord
@@ -207,7 +206,7 @@ def fuse_blocks(
             images = {known.block.block_id: known.images for known in batch}
             tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points))
             reporter.fused(len(batch))
-            give_back()
+            executor.give_back()
     return tally
 
 
