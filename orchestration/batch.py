@@ -102,8 +102,7 @@ def fuse_batch(
     accepted, tests = _stage_one(blocks, images, base, executor, reporter, refused)
     against = {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
     blocks, move = _register([block for block in blocks if block.block_id in accepted], images, accepted, against, base, refused, executor)
-    ledger = Ledger.of(base)
-    unsaid = [r for r in refused if not ledger.said(r.block_id, r.reason)]
+    unsaid = _unsaid(refused, base)
     if not blocks and not unsaid:
         return BatchResult(base.number, (), tuple(refused), (), (), {}, (), ())  # the same command again writes nothing
     settled = settle(session, base, move, executor, reporter)
@@ -133,6 +132,14 @@ def fuse_batch(
         version, tuple(blocks), tuple(refused), doubtful, settled.flagged, settled.contradicted,
         tuple(r.tile for r in settled.reports), tuple(r.tile for r in settled.reports if not r.converged),
     )  # fmt: skip
+
+
+def _unsaid(refused: Sequence[Rejected], base: Snapshot) -> list[Rejected]:
+    """Rejections that the ledger does not have as its last word on the block."""
+    if not refused:
+        return []
+    ledger = Ledger.of(base)
+    return [r for r in refused if not ledger.said(r.block_id, r.reason)]
 
 
 def _stage_one(

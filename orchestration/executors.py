@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from typing import Any, Protocol, TypeVar
 
+from orchestration.local_cluster import Deserted, local_cluster
 from orchestration.memory import give_back, own_peak_memory_mb
 from orchestration.task_record import TaskRecord, added, recorded, taken_notes
-from submin.adjustment.warm_up import compile_kernels
 from submin.errors import ClusterError, InputError, KilledTaskError
 
 SHARED_VALUES_GO_WITH_TASKS = {"distributed.admin.large-graph-warning-threshold": "1GB"}
@@ -152,8 +150,10 @@ class DaskExecutor:
     Every handle is the result of a task: what a lost worker held is computed again.
     """
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self, client: Any, deserted: Deserted | None = None) -> None:
+        """``deserted`` tells of workers of this machine, where they are, whether all are gone for good."""
         self.client = client
+        self._deserted = deserted
         self.workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
         self._address = client.scheduler.address
 
@@ -288,6 +288,11 @@ class DaskExecutor:
             raise self._lost()
 
     def _lost(self) -> ClusterError:
+        if self._deserted is not None and self._deserted.is_set():
+            return ClusterError(
+                "all workers were lost and did not come again, as when a machine has run out of memory",
+                "end what else runs there, or take smaller batches, and give the same command again",
+            )
         return ClusterError(f"the Dask scheduler at {self._address} was lost", "start a cluster and give the same command again")
 
 
@@ -308,7 +313,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         yield ThreadExecutor(os.cpu_count() or 1)
         return
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     if scheduler is not None:
         # what Dask logs of a lost scheduler, with tracebacks, is raised too
@@ -320,32 +325,5 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), client:
             yield DaskExecutor(client)
         return
-    compile_kernels()
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    # set before the workers load numpy
-    settings = {
-        "distributed.nanny.pre-spawn-environ": threads, "distributed.worker.memory.terminate": False,
-        # a killed worker may take long to come again where machines are busy; given up after this, it never would, and be waited for
-        "distributed.deploy.lost-worker-timeout": "1 day",
-    }  # fmt: skip
-    with dask.config.set(settings | SHARED_VALUES_GO_WITH_TASKS):
-        with _children_deaf_to_ctrl_c():
-            cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL
-            )  # fmt: skip
-        with cluster, Client(cluster) as client:
-            yield DaskExecutor(client)
-
-
-@contextmanager
-def _children_deaf_to_ctrl_c() -> Iterator[None]:
-    """Processes that are started in the body, or later by threads that are, do not get the terminal's Ctrl-C.
-
-    It goes to every process of the group; ending the workers is the coordinator's part. Here it comes when the body is left.
-    """
-    resource_tracker.ensure_running()  # where it starts, it would unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), local_cluster(workers) as (client, deserted):
+        yield DaskExecutor(client, deserted)

@@ -22,7 +22,7 @@ def describe(network: Network) -> dict[str, Any]:
     if network.dense is not None:
         return _describe_dense(network, network.dense)
     snapshot = network.snapshot
-    cells = [snapshot.cell_attributes(number) for number in network.cell_numbers()]
+    cells = snapshot.cell_counts(network.cell_numbers())
     images = snapshot.image_columns(["image_id", "sensor", "released", "withdrawn"])
     here = (images["withdrawn"] == 0) & ~np.isin(images["sensor"], SURVEYS)
     ledger = Ledger.of(snapshot)

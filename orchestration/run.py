@@ -212,7 +212,7 @@ def fuse_blocks(
 
 def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -> RunResult:
     released = {row for _, row in after.flags()} - tally.released
-    cells = [after.cell_attributes(number) for number in after.cell_numbers()]
+    cells = after.cell_counts(after.cell_numbers())
     used, in_pixels = (sum(cell[name] for cell in cells) for name in ("accepted", "pixel_rays"))
     square = sum(cell["square_px"] for cell in cells)
     return RunResult(

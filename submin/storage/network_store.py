@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -276,9 +276,10 @@ class Snapshot:
         there = existing_groups(group_of(self.root, "cells"), map(self.cover.cell_name, numbers))
         return tuple(number for number, exists in zip(numbers, there, strict=True) if exists)
 
-    def cell_attributes(self, number: int) -> dict[str, Any]:
-        """Counts of a cell, without reading it."""
-        return attributes_of(group_of(self.root, "cells/" + self.cover.cell_name(number)))
+    def cell_counts(self, numbers: Sequence[int]) -> list[Mapping[str, Any]]:
+        """Counts of some cells that are there, without reading their arrays."""
+        found = read_records(group_of(self.root, "cells"), map(self.cover.cell_name, numbers), ())
+        return [record.attributes for record in found if record is not None]
 
     def tile_numbers(self) -> tuple[int, ...]:
         """Tiles that have a sub-MIN, ascending."""

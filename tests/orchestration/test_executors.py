@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
 
+from orchestration import local_cluster
 from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, ThreadExecutor, executor_for
 from orchestration.read_ahead import batches_ahead
 from submin.errors import ClusterError, InputError, KilledTaskError
@@ -176,6 +178,17 @@ def test_what_killed_workers_held_is_computed_again() -> None:
         assert executor.results(executor.submit_all(double, [(doubled[0],), (shared,)], "again", lambda: None)) == [84, 42]
         assert executor.results([shared]) == [21]
         assert not workers & set(executor.client.run(os.getpid).values())  # type: ignore[attr-defined]
+
+
+def test_workers_that_do_not_come_again_are_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_cluster, "GIVEN_UP", 0.5)
+    with executor_for(2) as executor:
+        cluster = executor.client.cluster  # type: ignore[attr-defined]
+        closing = threading.Timer(1.0, lambda: [cluster.sync(nanny.close) for nanny in cluster.workers.values()])
+        closing.start()
+        with pytest.raises(ClusterError, match="all workers were lost and did not come again.*give the same command again"):
+            executor.submit_all(nap, [(60.0,), (60.0,)], "nap", lambda: None)
+        closing.join()
 
 
 def test_a_task_that_kills_its_workers_is_named() -> None:

@@ -41,7 +41,7 @@ def found(network: str) -> dict[str, TilePlan]:
     for tile in snapshot.tile_numbers():
         images = snapshot.tile_images(tile)
         cells = [cell for cell in cover.cells_held(tile) if cell in snapshot.cell_numbers()]
-        rays = sum(snapshot.cell_attributes(cell)["rays"] for cell in cells)
+        rays = sum(counts["rays"] for counts in snapshot.cell_counts(cells))
         of_images = {block for block in blocks[images].tolist() if not block.startswith(CONTROL_PREFIX)}
         tiles[cover.tile_name(tile)] = TilePlan("", len(of_images), len(images), 6 * len(images), rays)
     return tiles

@@ -57,7 +57,7 @@ class Store:
         before = Snapshot.open(self.place)
         self.session, self.base = begin_change(self.place, before.number)
         self.root = zarr.open_group(self.session.store, mode="r+")
-        self.busiest = max(self.base.cell_numbers(), key=lambda number: self.base.cell_attributes(number)["rays"])
+        self.busiest = max(self.base.cell_numbers(), key=lambda number: self.base.cell_counts([number])[0]["rays"])
         self.cell_name = self.base.cover.cell_name(self.busiest)
         self.owner = self.base.cover.tile_name(self.base.cover.owner(self.busiest))
 
@@ -171,7 +171,7 @@ def stale_factor(store: Store) -> list[Found]:
     cell = store.base.cell(store.busiest)
     cell.rays.observed[3, 1] += 0.5
     images = image_set(store.base.images(cell.images), store.base.metadata.ellipsoid, store.base.metadata.parameters)
-    counts = store.base.cell_attributes(store.busiest)
+    counts = store.base.cell_counts([store.busiest])[0]
     write_cell(store.root, store.cell_name, summed(cell, images), counts["square_px"], counts["pixel_rays"])
     return [("stale-factor", store.base.cover.tile_name(tile)) for tile in store.base.cover.holders(store.busiest)]
 

@@ -380,7 +380,7 @@ def test_cell_comes_back(tmp_path: Path) -> None:
     without = snapshot.cell(number, with_sums=False)
     assert_same_cell(without, cell)
     assert without.sums.information.size == 0
-    attributes = snapshot.cell_attributes(number)
+    attributes = snapshot.cell_counts([number])[0]
     accepted = [int(cell.rays.accepted[cell.rays.point == j].sum()) for j in range(len(cell))]
     assert (attributes["points"], attributes["rays"], attributes["accepted"]) == (5, 15, sum(accepted))
     assert attributes["determined"] == sum(count >= 2 for count in accepted)

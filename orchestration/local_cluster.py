@@ -1,0 +1,83 @@
+"""Worker processes on this machine, which come again when they are killed; where they cannot, a run must not wait for them for ever."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import Any
+
+from submin.adjustment.warm_up import compile_kernels
+
+GIVEN_UP = 120.0
+"""Seconds without a single worker after which none is waited for: a killed one comes again in a few, on a busy machine in tens of them."""
+LOOKED_EVERY = 1.0
+THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+SETTINGS = {
+    "distributed.nanny.pre-spawn-environ": THREADS,  # set before the workers load numpy
+    "distributed.worker.memory.terminate": False,
+    # a killed worker may take long to come again where machines are busy; given up after this, it never would, and be waited for
+    "distributed.deploy.lost-worker-timeout": "1 day",
+}
+
+
+class Deserted(threading.Event):
+    """Set once there has been no worker for so long that none is waited for any more."""
+
+
+@contextmanager
+def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
+    """A Dask client of so many worker processes, one BLAS thread each; it is closed when all of them are gone for good."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    compile_kernels()
+    with dask.config.set(SETTINGS):
+        with _children_deaf_to_ctrl_c():
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL
+            )  # fmt: skip
+        with cluster, Client(cluster) as client, _watched(cluster, client) as deserted:
+            yield client, deserted
+
+
+@contextmanager
+def _watched(cluster: Any, client: Any) -> Iterator[Deserted]:
+    """Close the client once the cluster has had no worker for `GIVEN_UP` seconds: whoever waits for a task is then told."""
+    deserted, done = Deserted(), threading.Event()
+
+    def watch() -> None:
+        last = time.monotonic()
+        while not done.wait(LOOKED_EVERY):
+            if cluster.scheduler.workers:
+                last = time.monotonic()
+            elif time.monotonic() - last > GIVEN_UP:
+                deserted.set()
+                client.close()
+                return
+
+    watcher = threading.Thread(target=watch, name="workers-watched", daemon=True)
+    watcher.start()
+    try:
+        yield deserted
+    finally:
+        done.set()
+        watcher.join()
+
+
+@contextmanager
+def _children_deaf_to_ctrl_c() -> Iterator[None]:
+    """Processes that are started in the body, or later by threads that are, do not get the terminal's Ctrl-C.
+
+    It goes to every process of the group; ending the workers is the coordinator's part. Here it comes when the body is left.
+    """
+    resource_tracker.ensure_running()  # where it starts, it would unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
