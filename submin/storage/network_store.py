@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property, lru_cache
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,7 @@ from submin.storage.arrays import (
     existing_groups,
     group_of,
     member_names,
+    read_attributes,
     read_record,
     read_records,
     read_spans,
@@ -203,8 +206,14 @@ def tag_version(place: str, tag: str, name: str | None = None) -> Version:
     return replace(version, tags=(*version.tags, tag))
 
 
+@lru_cache(maxsize=4)
+def _cover(text: str) -> Cover:
+    """The cover of a description: versions share it, and with it what it has worked out of its cells."""
+    return Cover.from_mapping(json.loads(text))
+
+
 class Snapshot:
-    """One version of a network, read only. Everything is read when asked for; nothing is kept but small tables."""
+    """One version of a network, read only. Everything is read when asked for; only names and the directory are kept."""
 
     def __init__(self, root: zarr.Group, place: str, cover: Cover | None = None, parameters: int = 0) -> None:
         """``cover`` and ``parameters`` are those of the version being made: its tiles may be finer, its images may need more parameters."""
@@ -212,7 +221,7 @@ class Snapshot:
         self.place = place
         stored = NetworkMetadata.from_attributes(attributes_of(root), place)
         self.metadata = replace(stored, parameters=max(stored.parameters, parameters))
-        self.cover = Cover.from_mapping(self.metadata.cover) if cover is None else cover
+        self.cover = _cover(json.dumps(self.metadata.cover)) if cover is None else cover
         self.number = int(attributes_of(root)["version"])
 
     @classmethod
@@ -269,6 +278,10 @@ class Snapshot:
 
     def cell_numbers(self) -> tuple[int, ...]:
         """Cells that hold points or rays, ascending."""
+        return self._cell_numbers
+
+    @cached_property
+    def _cell_numbers(self) -> tuple[int, ...]:
         return tuple(sorted(map(self.cover.cell_number, member_names(group_of(self.root, "cells")))))
 
     def existing_cells(self, numbers: Sequence[int]) -> tuple[int, ...]:
@@ -278,11 +291,15 @@ class Snapshot:
 
     def cell_counts(self, numbers: Sequence[int]) -> list[Mapping[str, Any]]:
         """Counts of some cells that are there, without reading their arrays."""
-        found = read_records(group_of(self.root, "cells"), map(self.cover.cell_name, numbers), ())
-        return [record.attributes for record in found if record is not None]
+        found = read_attributes(group_of(self.root, "cells"), map(self.cover.cell_name, numbers))
+        return [attributes for attributes in found if attributes is not None]
 
     def tile_numbers(self) -> tuple[int, ...]:
         """Tiles that have a sub-MIN, ascending."""
+        return self._tile_numbers
+
+    @cached_property
+    def _tile_numbers(self) -> tuple[int, ...]:
         return tuple(sorted(map(self.cover.tile_number, member_names(group_of(self.root, "tiles")))))
 
     def has_tile(self, tile: int) -> bool:
@@ -344,6 +361,10 @@ class Snapshot:
 
     def directory(self) -> Directory:
         """The directory of all points, 16 bytes each."""
+        return self._directory
+
+    @cached_property
+    def _directory(self) -> Directory:
         columns = read_table(group_of(self.root, "directory"))
         return Directory(columns["hash"], columns["cell"])
 
