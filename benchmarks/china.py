@@ -26,9 +26,9 @@ from benchmarks.record import write_record
 from benchmarks.sparse_adjustment import SparseAdjustment, adjusted_points, located
 from orchestration.executors import executor_for
 from orchestration.run import run
-from submin.adjustment.warm_up import compile_kernels
 from submin.geodesy import geodetic_to_geocentric, local_axes, rotate_covariance
 from submin.query.planner import points_of_tile
+from submin.query.warm_up import compile_kernels
 from submin.storage.catalogue import Catalogue
 
 Rows = list[dict[str, Any]]

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import Any
 
-from submin.adjustment.warm_up import compile_kernels
+from submin.query.warm_up import compile_kernels
 
 GIVEN_UP = 120.0
 """Seconds without a single worker after which none is waited for: a killed one comes again in a few, on a busy machine in tens of them."""

@@ -206,7 +206,7 @@ class RpcSensor:
 
     def mean_height(self, cameras: Array) -> Array:
         """The height offset of each RPC."""
-        return cameras[:, _H_OFF]
+        return cameras[:, _H_OFF].copy()  # contiguous, as heights of rays are: the kernel is compiled once
 
 
 def image_centres(cameras: Array) -> Array:

@@ -38,8 +38,8 @@ from orchestration.control import add_control
 from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.run import run
-from submin.adjustment.warm_up import compile_kernels
 from submin.formats.tables import covariance_rows
+from submin.query.warm_up import compile_kernels
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata

@@ -6,25 +6,30 @@ import numpy as np
 import scipy.sparse as sp
 
 from submin.adjustment.adjustment import adjust
-from submin.adjustment.elimination import linearise, point_factors
+from submin.adjustment.elimination import linearise, moved_by_ground, point_factors
 from submin.adjustment.estimation import variances_of
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
 from submin.adjustment.rays import sorted_rays
-from submin.adjustment.symmetric import DENSE_SIZE, add_into, between, fill_symmetric, permuted
+from submin.adjustment.symmetric import DENSE_SIZE, add_into, between, fill_symmetric, packed, permuted, unpacked
+from submin.network.sub_min import GroundPart, loadings
+from submin.query.spread import spread_rows
 from submin.sensors import sensor_named
 
 
 def compile_kernels() -> None:
-    """Adjust two points in two images, which goes through every kernel; a second when they are in the cache already."""
-    linear, one = np.zeros(20), np.zeros(20)
+    """Adjust two points in two images, and test them by a network: every kernel that a run needs; a second when they are in the cache.
+
+    A kernel that is not called here is compiled by each worker for itself (`tests/orchestration/test_warm_up.py`).
+    """
+    first_order, one = np.zeros(20), np.zeros(20)
     one[0] = 1.0
     cameras = []
     for tilt in (-0.5, 0.5):
         camera = dict.fromkeys(("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF"), 0.0)
         camera |= dict.fromkeys(("LINE_SCALE", "SAMP_SCALE", "HEIGHT_SCALE"), 1000.0) | dict.fromkeys(("LAT_SCALE", "LONG_SCALE"), 0.01)
-        samples, lines = linear.copy(), linear.copy()
+        samples, lines = first_order.copy(), first_order.copy()
         samples[1], lines[2], lines[3] = 1.0, 1.0, tilt
         polynomials = {"SAMP_NUM_COEFF": samples, "SAMP_DEN_COEFF": one, "LINE_NUM_COEFF": lines, "LINE_DEN_COEFF": one}
         cameras.append(sensor_named("rpc").pack(camera | polynomials, 2000, 2000))
@@ -36,7 +41,13 @@ def compile_kernels() -> None:
     rays = sorted_rays(index, image, observed, np.full((4, 2), 0.5), np.ones(4, dtype=np.bool_))
     ground = intersect(images, rays, 2)
     adjust(images, rays, ground)
-    point_factors(linearise(images, rays, np.zeros((2, images.parameters)), ground, ground), np.ones(4))  # what a cell keeps of its points
+    images.localise(image, observed)
+    linear = linearise(images, rays, np.zeros((2, images.parameters)), ground, ground)
+    moved_by_ground(linear, np.zeros((2, 3)))
+    # what a cell keeps of its points, what a record keeps of a covariance, and which points a block is tested by
+    loadings([GroundPart(ground, linear, point_factors(linear, np.ones(4)))], np.arange(2, dtype=np.int32), images.parameters)
+    unpacked(packed(np.eye(2)))
+    spread_rows(np.arange(6.0).reshape(3, 2), np.ones(3), np.array(["a", "b", "c"]), 2)
     variances_of(np.eye(2, order="F"), sp.eye_array(2, format="csr"))
     # the sums of a tile are large and sparse, which those of two images are not
     many = DENSE_SIZE + 1
