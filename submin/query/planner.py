@@ -245,19 +245,8 @@ def hold_all(source: NetworkSource, tiles: Sequence[int]) -> bool:
 
 def determined_parts(source: NetworkSource, selections: Sequence[Selection]) -> tuple[list[Selection], list[GroundPart]]:
     """Those of some points that are determined, and their ground parts; cells without any are left out."""
-    rows = images_of(selections)
-    return determined_among(selections, rows, source.image_set(rows))
-
-
-def images_of(selections: Sequence[Selection]) -> NDArray[np.int32]:
-    """Rows (ascending) of the images that the cells of some points see."""
-    return np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(s.cell.images for s in selections)]))
-
-
-def determined_among(
-    selections: Sequence[Selection], rows: NDArray[np.int32], images: ImageSet
-) -> tuple[list[Selection], list[GroundPart]]:
-    """As `determined_parts`, with the images of these rows at hand; a pure function of them."""
+    rows = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(s.cell.images for s in selections)]))
+    images = source.image_set(rows)
     both = [ground_part(s, images.take(np.searchsorted(rows, s.cell.images))) for s in selections]
     return [kept for kept, _ in both if len(kept.rows)], [part for kept, part in both if len(kept.rows)]
 

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from datetime import date
-from functools import partial
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from submin import accuracy
-from submin.geodesy import Ellipsoid, geocentric_to_geodetic, local_axes, rotate_covariance
-from submin.network.sub_min import GroundPart, SubMin, covariances_of, locate
-from submin.query.planner import Rows, Selection, determined_among, images_of, points_of_tile, ray_counts
+from submin.geodesy import geocentric_to_geodetic, local_axes, rotate_covariance
+from submin.network.sub_min import covariances_of, locate
+from submin.query.planner import Rows, Selection, determined_parts, points_of_tile, ray_counts
 from submin.query.tile import tile_state
 from submin.storage.dense_reader import DenseReader
 
@@ -63,13 +59,12 @@ class PointAccuracy:
 def accuracy_of_all(network: Network, day: date) -> PointAccuracy:
     """Every determined point, thinned and retired ones too, as policy ``tile`` has it from the tile whose core holds the point.
 
-    Points whose rays determine no position are left out. Memory is that of as many tiles' sub-MINs, and of their own points, as there
-    are cores.
+    Points whose rays determine no position are left out. Memory is that of one tile's sub-MIN and of its own points.
     """
     if network.dense is not None:
         return accuracy_of_dense(network.dense)
     owned = (points_of_tile(network, tile, core=True) for tile in network.snapshot.tile_numbers())
-    return _joined(_of_tiles(network, ((network.cover.owner(found[0].cell.number), found) for found in owned if found), day))
+    return _joined(_of_tile(network, network.cover.owner(found[0].cell.number), found, day) for found in owned if found)
 
 
 def accuracy_of(network: Network, selections: Sequence[Selection], day: date, tile: int | None = None) -> PointAccuracy:
@@ -77,7 +72,7 @@ def accuracy_of(network: Network, selections: Sequence[Selection], day: date, ti
     by_tile: dict[int, list[Selection]] = {}
     for selection in selections:
         by_tile.setdefault(network.cover.owner(selection.cell.number) if tile is None else tile, []).append(selection)
-    return _joined(_of_tiles(network, sorted(by_tile.items()), day))
+    return _joined(_of_tile(network, number, by_tile[number], day) for number in sorted(by_tile))
 
 
 def accuracy_of_dense(dense: DenseReader, rows: Rows | None = None) -> PointAccuracy:
@@ -90,34 +85,15 @@ def accuracy_of_dense(dense: DenseReader, rows: Rows | None = None) -> PointAccu
     return found if rows is None else found.take(rows)
 
 
-def _of_tiles(network: Network, tiles: Iterable[tuple[int, Sequence[Selection]]], day: date) -> Iterator[PointAccuracy]:
-    """Accuracy of some points of each of some tiles that hold them: as many tiles side by side as there are cores, one read at a time."""
-    left = iter(tiles)
-    with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="accuracy") as pool:
-        while group := list(islice(left, os.cpu_count() or 1)):
-            asked = []
-            for _, selections in group:
-                rows = images_of(selections)
-                asked.append((selections, rows, network.image_set(rows)))
-            found = pool.map(lambda one: determined_among(*one), asked)
-            of_tiles = [(tile, kept, parts) for (tile, _), (kept, parts) in zip(group, found, strict=True) if parts]
-            states = [
-                tile_state(network, tile, np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32))
-                for tile, _, parts in of_tiles
-            ]
-            computed = pool.map(partial(_coordinates_and_covariances, network.cover.ellipsoid), (parts for *_, parts in of_tiles), states)
-            for (tile, kept, _), (geodetic, local) in zip(of_tiles, computed, strict=True):
-                yield _told(network, tile, kept, geodetic, local, day)
-
-
-def _coordinates_and_covariances(ellipsoid: Ellipsoid, parts: Sequence[GroundPart], state: SubMin) -> tuple[Array, Array]:
-    """Longitude, latitude and height (n, 3) of a tile's points, and each one's covariance (n, 3, 3) in its local axes."""
-    geodetic = geocentric_to_geodetic(np.concatenate([locate(part, state) for part in parts]), ellipsoid)
-    covariance = np.concatenate([covariances_of(part, state) for part in parts])
-    return geodetic, rotate_covariance(covariance, local_axes(geodetic))
-
-
-def _told(network: Network, tile: int, kept: Sequence[Selection], geodetic: Array, local: Array, day: date) -> PointAccuracy:
+def _of_tile(network: Network, tile: int, selections: Sequence[Selection], day: date) -> PointAccuracy:
+    """Accuracy of some points from one tile that holds them."""
+    kept, parts = determined_parts(network, selections)
+    if not parts:
+        return _joined([])
+    images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
+    state = tile_state(network, tile, images)
+    geodetic = geocentric_to_geodetic(np.concatenate([locate(part, state) for part in parts]), network.cover.ellipsoid)
+    local = rotate_covariance(np.concatenate([covariances_of(part, state) for part in parts]), local_axes(geodetic))
     return PointAccuracy(
         ids=np.concatenate([s.cell.point_ids[s.rows] for s in kept]),
         geodetic=geodetic,
