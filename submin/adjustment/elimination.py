@@ -29,6 +29,9 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 Offsets = NDArray[np.int64]
 
+FITTED_SIGMAS = 5.0
+"""A residual that is no larger may be an error of measurement; that of a ray that is accepted is smaller."""
+
 
 @dataclass(frozen=True)
 class LinearRays:
@@ -89,14 +92,16 @@ class PointFactors:
 def linearise(images: ImageSet, rays: Rays, theta: Array, linearised_at: Array, origin: Array) -> LinearRays:
     """Linearise rays at image corrections ``theta`` (m, p) and ground positions ``linearised_at`` (n, 3).
 
-    ``origin`` (n, 3) is the fixed origin of each point's coordinates.
+    ``origin`` (n, 3) is the fixed origin of each point's coordinates. A drift is that of the fitted coordinates (docs/decisions/018): the
+    measured ones less their residual here, if that may be an error of measurement (`FITTED_SIGMAS`), else the measured ones.
     """
     ground = images.ground(linearised_at)
     seen = images.project(theta, ground, rays.image, rays.point, rays.observed)
     # the arrays of the projection become those of the rays
     y = _whiten(
-        seen.image, seen.by_ground, seen.by_parameters, rays.observed, rays.sigma, rays.image, rays.point, theta, linearised_at - origin
-    )
+        seen.image, seen.by_ground, seen.by_parameters, rays.observed, rays.sigma, rays.image, rays.point, theta, linearised_at - origin,
+        images.drifts.of, images.drifts.axis, images.drifts.by_pixel,
+    )  # fmt: skip
     return LinearRays(rays.first(len(origin)), rays.image, seen.by_ground, seen.by_parameters, y)
 
 
@@ -111,14 +116,30 @@ def _whiten(
     point: Index,
     theta: Array,
     shift: Array,
+    drift_of: Index,
+    drift_axis: Index,
+    drift_by_pixel: Array,
 ) -> Array:
-    """Divide partials by the sigmas of their coordinates, in place, and reduce the observations to ``y`` (r, 2)."""
-    y = np.empty(seen.shape)
+    """Divide partials by the sigmas of their coordinates, in place, and reduce the observations to ``y`` (r, 2).
+
+    Drifts, here those of the measured coordinates, become those of the fitted ones; ``y`` is the same with both.
+    """
+    y, residual = np.empty(seen.shape), np.empty(2)
     for r in range(len(seen)):
+        m = image[r]
+        fits = True
         for c in range(2):
-            whole, part = observed[r, c] - seen[r, c], 1.0 / sigma[r, c]
+            residual[c] = observed[r, c] - seen[r, c]
+            fits = fits and abs(residual[c]) <= FITTED_SIGMAS * sigma[r, c]
+        for c in range(2):
+            whole, part = residual[c], 1.0 / sigma[r, c]
             for u in range(by_parameters.shape[2]):
-                whole += by_parameters[r, c, u] * theta[image[r], u]
+                whole += by_parameters[r, c, u] * theta[m, u]
+            for u in range(by_parameters.shape[2] if fits else 0):
+                if drift_of[m, u] >= 0:
+                    along = drift_axis[m, u]
+                    by_parameters[r, c, u] -= by_parameters[r, c, drift_of[m, u]] * drift_by_pixel[m, along] * residual[along]
+            for u in range(by_parameters.shape[2]):
                 by_parameters[r, c, u] *= part
             for k in range(3):
                 whole += by_ground[r, c, k] * shift[point[r], k]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,10 +13,25 @@ from numpy.typing import NDArray
 
 from submin.adjustment.priors import ImagePrior, prior_factor, prior_variance
 from submin.geodesy import WGS84, Ellipsoid
-from submin.sensors import Ground, Projection, sensor_named
+from submin.sensors import DriftingSensor, Ground, Projection, sensor_named
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Drifts:
+    """Parameters of images that are another one times a factor that grows along the image (`submin.sensors.Drift`).
+
+    Attributes
+    ----------
+    of : (m, p) number of the other parameter, -1 for one that is no drift; axis : (m, p) along which the factor grows
+    by_pixel : (m, 2) by how much it grows a pixel along each axis
+    """
+
+    of: Index
+    axis: Index
+    by_pixel: Array
 
 
 @dataclass(frozen=True)
@@ -51,6 +67,20 @@ class ImageSet:
     def prior_variance(self) -> Array:
         """A priori variances (m, p) of the images' parameters."""
         return prior_variance(self.prior, self.parameters)
+
+    @cached_property
+    def drifts(self) -> Drifts:
+        """Which parameters drift over the image."""
+        of, axis = np.full((2, len(self), self.parameters), -1, dtype=np.int32)
+        by_pixel = np.zeros((len(self), 2))
+        for name in set(self.sensors):
+            sensor, rows = sensor_named(name), np.flatnonzero(np.array(self.sensors) == name)
+            drifts = {k: parameter.drift for k, parameter in enumerate(sensor.parameters) if parameter.drift is not None}
+            for k, drift in drifts.items():
+                of[rows, k], axis[rows, k] = drift.of, drift.axis
+            if drifts:
+                by_pixel[rows] = cast(DriftingSensor, sensor).drift_by_pixel(self.cameras[rows])
+        return Drifts(of, axis, by_pixel)
 
     @cached_property
     def in_pixels(self) -> NDArray[np.bool_]:

@@ -82,7 +82,8 @@ def leading(covariance: Array, factors: Array, count: int, tolerance: float = 0.
     if size <= DENSE or count > size // 4:
         half = by_component(covariance, transposed=False, solved=True)
         standard = by_component(np.ascontiguousarray(half.T), transposed=False, solved=True)
-        values, vectors = la.eigh(standard, subset_by_index=[size - count, size - 1])
+        # all of them: asked for some by their index, LAPACK finds none of a matrix that is the identity but for round-off
+        values, vectors = (part[..., size - count :] for part in la.eigh(standard, driver="evd"))
     else:
         operator = LinearOperator(
             (size, size), dtype=np.float64,

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from submin.errors import InputError
-from submin.sensors.base import Ground, Parameter, Projection, Sensor
+from submin.sensors.base import Drift, DriftingSensor, Ground, Parameter, Projection, Sensor
 from submin.sensors.frame import FrameSensor
 from submin.sensors.height import HeightSensor
 from submin.sensors.pushbroom import PushbroomSensor
@@ -31,4 +31,4 @@ def sensor_named(name: str) -> Sensor:
         raise InputError(f"sensor is {name!r}; expected one of {', '.join(sorted(SENSORS))}") from None
 
 
-__all__ = ["SENSORS", "SURVEYS", "Ground", "Parameter", "Projection", "Sensor", "sensor_named", "width_of"]
+__all__ = ["SENSORS", "SURVEYS", "Drift", "DriftingSensor", "Ground", "Parameter", "Projection", "Sensor", "sensor_named", "width_of"]

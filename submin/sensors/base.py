@@ -57,6 +57,20 @@ class Projection:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """What an adjustable parameter is another one times a factor that grows along the image: a polynomial, a rate times time.
+
+    Attributes
+    ----------
+    of : number of the other parameter
+    axis : along which the factor grows: 0 with the sample, 1 with the line
+    """
+
+    of: int
+    axis: int
+
+
+@dataclass(frozen=True)
 class Parameter:
     """One adjustable parameter of an image: a correction that is zero for the unadjusted camera.
 
@@ -67,6 +81,7 @@ class Parameter:
     group : parameters of a kind, which priors may name together: "bias", "position", "attitude"
     sigma : a priori, in its unit, where the priors of a block say nothing
     shared : True when the images of a pass can share an error in it
+    drift : set for a parameter that is another one times a factor
     """
 
     name: str
@@ -74,6 +89,7 @@ class Parameter:
     group: str
     sigma: float
     shared: bool = False
+    drift: Drift | None = None
 
 
 class Sensor(Protocol):
@@ -108,4 +124,12 @@ class Sensor(Protocol):
 
     def mean_height(self, cameras: Array) -> Array:
         """Height (m,) in metres near which each camera's ground is expected."""
+        ...
+
+
+class DriftingSensor(Sensor, Protocol):
+    """A sensor some of whose parameters are a `Drift`."""
+
+    def drift_by_pixel(self, cameras: Array) -> Array:
+        """By how much (m, 2) the factor of a drift grows a pixel, with the sample and with the line."""
         ...

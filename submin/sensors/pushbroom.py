@@ -15,9 +15,9 @@ In camera axes ``b = R' d``, corrected to ``b - theta x b`` with
     theta = (roll, pitch, yaw) + (rates) (t - t_mid)        t_mid: time of the middle line
 
 that is, small rotations of the camera about its own axes: roll about x (along track), pitch about y (across track), yaw about z (line of
-sight). In an adjustment t in ``theta`` is the time of the *measured* line (docs/decisions/005). In the focal plane the point is at
-``F = f (b_x, b_y) / b_z``. The line is where F falls onto the detector line, ``F(t) = origin + sample step``: one equation for t, solved by
-Newton, and one for the sample. Partials follow by implicit differentiation.
+sight). In an adjustment t in ``theta`` is the time of the *fitted* line, the measured one less its residual (docs/decisions/018). In the
+focal plane the point is at ``F = f (b_x, b_y) / b_z``. The line is where F falls onto the detector line, ``F(t) = origin + sample step``:
+one equation for t, solved by Newton, and one for the sample. Partials follow by implicit differentiation.
 
 Between samples, positions are cubic Hermite polynomials of the given positions and velocities, and quaternions cubic Hermite
 polynomials, normalised, with rates from a polynomial through the five nearest samples: both are smooth to the first derivative and of
@@ -35,8 +35,18 @@ from typing import Any
 import numpy as np
 
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic, local_axes
-from submin.sensors.base import Array, Ground, Index, Parameter, Projection
-from submin.sensors.pushbroom_camera import MEAN_HEIGHT, PER_LIGHT, ROTATION, SCALE_HEIGHT, TABLES, ZENITH_PATH, packed_camera
+from submin.sensors.base import Array, Drift, Ground, Index, Parameter, Projection
+from submin.sensors.pushbroom_camera import (
+    LINE_ROW,
+    LINES,
+    MEAN_HEIGHT,
+    PER_LIGHT,
+    ROTATION,
+    SCALE_HEIGHT,
+    TABLES,
+    ZENITH_PATH,
+    packed_camera,
+)
 from submin.sensors.pushbroom_sight import LOWEST_SIGHT, looks, project
 
 LOCALISED_METRES = 1e-7
@@ -71,9 +81,9 @@ class PushbroomSensor:
         Parameter("attitude roll", "rad", "attitude", 5e-6),
         Parameter("attitude pitch", "rad", "attitude", 5e-6),
         Parameter("attitude yaw", "rad", "attitude", 5e-6),
-        Parameter("rate roll", "rad/s", "rate", 5e-7),
-        Parameter("rate pitch", "rad/s", "rate", 5e-7),
-        Parameter("rate yaw", "rad/s", "rate", 5e-7),
+        Parameter("rate roll", "rad/s", "rate", 5e-7, drift=Drift(0, 1)),
+        Parameter("rate pitch", "rad/s", "rate", 5e-7, drift=Drift(1, 1)),
+        Parameter("rate yaw", "rad/s", "rate", 5e-7, drift=Drift(2, 1)),
     )
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
@@ -100,6 +110,13 @@ class PushbroomSensor:
         geodetic[sighted] = _cut(headers, position[sighted], speed[sighted], light[sighted], h, ellipsoid)
         geodetic[:, 2] = heights
         return geodetic
+
+    def drift_by_pixel(self, cameras: Array) -> Array:
+        """See `DriftingSensor.drift_by_pixel`: a rate acts on time, which passes with the lines, here at its mean rate."""
+        row, first = np.arange(len(cameras)), np.full(len(cameras), TABLES)
+        last = TABLES + LINE_ROW * (cameras[:, LINES].astype(np.int64) - 1)
+        seconds, lines = (cameras[row, last + k] - cameras[row, first + k] for k in range(2))
+        return np.column_stack([np.zeros(len(cameras)), seconds / lines])
 
     def mean_height(self, cameras: Array) -> Array:
         """The height that each description gives."""

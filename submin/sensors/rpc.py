@@ -10,9 +10,10 @@ image, ``s = (sample_rpc - centre) / half width`` and ``l`` likewise:
 
     sample = sample_rpc + a0 + a1 s + a2 l                                line = line_rpc + b0 + b1 s + b2 l
 
-In an adjustment s and l are those of the *measured* coordinates: the correction is then linear in its parameters and the same wherever the
-point is linearised. Taken at the predicted coordinates they would move with the datum, and cells linearised at different datums would
-seem to know it.
+In an adjustment s and l are those of the *fitted* coordinates, the measured ones less their residual: the correction is then linear in its
+parameters. With the coordinates that the unadjusted camera predicts they would move with the datum, and cells linearised at different
+datums would seem to know it (docs/decisions/005). With measured ones their errors would add up, and make images a little too large and a
+network too small (docs/decisions/018).
 
 The centre of the first pixel is (0, 0).
 """
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 
 from submin.errors import InputError
 from submin.geodesy import Ellipsoid
-from submin.sensors.base import Array, Ground, Index, Parameter, Projection
+from submin.sensors.base import Array, Drift, Ground, Index, Parameter, Projection
 
 SCALARS = (
     "LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF",
@@ -157,12 +158,12 @@ class RpcSensor:
     name = "rpc"
     unit = "pixel"
     parameters: tuple[Parameter, ...] = tuple(
-        Parameter(f"{axis} {name}", "px", group, sigma, shared)
-        for axis in ("sample", "line")
-        for name, group, sigma, shared in (
-            ("bias", "bias", 10.0, True),
-            ("drift along samples", "drift along samples", 1.0, False),
-            ("drift along lines", "drift along lines", 1.0, False),
+        Parameter(f"{axis} {name}", "px", group, sigma, shared, drift)
+        for of, axis in ((0, "sample"), (3, "line"))
+        for name, group, sigma, shared, drift in (
+            ("bias", "bias", 10.0, True, None),
+            ("drift along samples", "drift along samples", 1.0, False, Drift(of, 0)),
+            ("drift along lines", "drift along lines", 1.0, False, Drift(of, 1)),
         )
     )
 
@@ -203,6 +204,10 @@ class RpcSensor:
     def localise(self, cameras: Array, image: Index, samples: Array, lines: Array, heights: Array, ellipsoid: Ellipsoid) -> Array:
         """See `Sensor.localise`."""
         return np.asarray(_localise(cameras, image, samples, lines, heights))
+
+    def drift_by_pixel(self, cameras: Array) -> Array:
+        """See `DriftingSensor.drift_by_pixel`: coordinates are scaled to the image."""
+        return np.asarray(1.0 / cameras[:, [_HALF_WIDTH, _HALF_HEIGHT]])
 
     def mean_height(self, cameras: Array) -> Array:
         """The height offset of each RPC."""

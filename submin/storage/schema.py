@@ -22,7 +22,7 @@ from submin.network.sub_min import SubMin, wider
 from submin.storage.arrays import PLAIN, WRITTEN_WHOLE, Record, attributes_of, group_of, read_matrix, read_record, write_record
 from submin.storage.catalogue_schema import ImageRecord
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 COVARIANCE_CHUNK = 256
 
 IMAGE_COLUMNS = {

@@ -128,6 +128,7 @@ def test_a_reconciled_network_takes_a_sensor_with_more_parameters(
     whole = truth(opened)
     for tile in opened.snapshot.tile_numbers():
         answer = opened.query(tile=opened.cover.tile_name(tile))
-        assert excess(answer.covariance, points(opened, [tile], whole)[2]) <= 1.0 + 1e-6
+        # what came is linearised anew, and with it the drift of rays that were there: 0.8e-6 without that, 1.4e-6 with it (decision 018)
+        assert excess(answer.covariance, points(opened, [tile], whole)[2]) <= 1.0 + 2e-6
     reconcile(str(network), SerialExecutor())
     whole_network(network)

@@ -129,7 +129,10 @@ def projected(images: Sequence[NetworkImage], theta: Array, ground: Ground, rays
         of_image, sensor = np.flatnonzero(rays.image == k), sensor_named(image.sensor)
         camera = sensor.pack(json.loads(image.camera), image.width, image.height)[None]
         first = np.zeros(len(of_image), dtype=np.int32)
-        part = sensor.project(camera, theta[k : k + 1], ground, first, rays.point[of_image], rays.observed[of_image])
+        measured, sigma = rays.observed[of_image], rays.sigma[of_image]
+        missed = measured - sensor.project(camera, theta[k : k + 1], ground, first, rays.point[of_image], measured).image
+        missed[(np.abs(missed) > 5.0 * sigma).any(axis=1)] = 0.0
+        part = sensor.project(camera, theta[k : k + 1], ground, first, rays.point[of_image], measured - missed)
         whole.image[of_image], whole.by_ground[of_image] = part.image, part.by_ground
         whole.by_parameters[of_image, :, : len(sensor.parameters)] = part.by_parameters
     return whole

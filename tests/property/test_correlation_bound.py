@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import scipy.linalg as la
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.bundle import solve
@@ -123,6 +123,7 @@ def test_five_blocks_are_bounded_by_every_family(family: Family) -> None:
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31), n=st.integers(3, 12))
+@example(seed=60, n=4)
 def test_correlations_of_a_family_are_found_again(seed: int, n: int) -> None:
     """A covariance that is made of functions is condensed without loss: kappa is one."""
     points = random_points(seed, n, 3)

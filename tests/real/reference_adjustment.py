@@ -50,6 +50,7 @@ class Observations:
     image_ids : (m,) as the network lists them; cameras : (m, 94); prior : (6 m, 6 m) Q, pixels squared
     point, image : (r,) rows of these; observed, sigma : (r, 2) pixels
     theta : (r, 6) corrections of the ray's image and ground : (r, 3) position of its point, where the ray is linearised
+    fitted : (r, 2) image coordinates at which drift is evaluated: the measured ones less their residual where the ray is linearised
     """
 
     point_ids: NDArray[np.str_]
@@ -63,6 +64,7 @@ class Observations:
     sigma: Array
     theta: Array
     ground: Array
+    fitted: Array
 
 
 @dataclass(frozen=True)
@@ -166,11 +168,22 @@ def stored_observations(snapshot: Snapshot, *, every_ray: bool = False, unreleas
     cell_of_ray = np.concatenate(cells)
     assert np.array_equal(cell_of_ray, cell_of_ray[first][point]), "a point has rays in two cells"
     prior = prior_covariance([(i.pass_id, i.released and i.image_id not in unreleased, i.a_priori) for i in images])
-    return Observations(
+    observations = Observations(
         point_ids, np.concatenate(origin)[first], tuple(i.image_id for i in images),
         np.stack([sensor.pack(json.loads(i.camera), i.width, i.height) for i in images]), prior,
         point, np.concatenate(image), np.concatenate(observed), np.concatenate(sigma), np.concatenate(theta), np.concatenate(ground),
+        np.concatenate(observed),
     )  # fmt: skip
+    return fitted_again(observations)
+
+
+def fitted_again(observations: Observations) -> Observations:
+    """The same with drift at the coordinates that are fitted where the rays are linearised now (docs/decisions/018)."""
+    o, every = observations, np.arange(len(observations.point), dtype=np.int32)
+    seen = sensor_named("rpc").project(o.cameras[o.image], o.theta, Ground.at(o.ground), every, every, o.observed).image
+    residual = o.observed - seen
+    residual[(np.abs(residual) > 5.0 * o.sigma).any(axis=1)] = 0.0
+    return replace(o, fitted=o.observed - residual)
 
 
 def adjust_linearised(observations: Observations) -> Solution:
@@ -179,7 +192,7 @@ def adjust_linearised(observations: Observations) -> Solution:
     m, n = len(o.image_ids), len(o.point_ids)
     every = np.arange(rays, dtype=np.int32)
     # a camera and a state for every ray, because cells are linearised apart
-    projection = sensor_named("rpc").project(o.cameras[o.image], o.theta, Ground.at(o.ground), every, every, o.observed)
+    projection = sensor_named("rpc").project(o.cameras[o.image], o.theta, Ground.at(o.ground), every, every, o.fitted)
     y = o.observed - projection.image
     y += np.einsum("rcp,rp->rc", projection.by_parameters, o.theta)
     y += np.einsum("rck,rk->rc", projection.by_ground, o.ground - o.origin[o.point])
@@ -208,13 +221,16 @@ def adjust_linearised(observations: Observations) -> Solution:
     )  # fmt: skip
 
 
-def adjust(observations: Observations, iterations: int = 20) -> Solution:
-    """The nonlinear least-squares solution of the same rays: from unadjusted cameras and the origins, linearised anew until none moves."""
+def adjust(observations: Observations, iterations: int = 20, *, refitted: bool = False) -> Solution:
+    """The nonlinear least-squares solution of the same rays: from unadjusted cameras and the origins, linearised anew until none moves.
+
+    Drift stays at the coordinates that the network has fitted, or is ``refitted`` to this solution.
+    """
     m = len(observations.image_ids)
     theta, ground = np.zeros((m, P)), observations.origin
     for _ in range(iterations):
         at = replace(observations, theta=theta[observations.image], ground=ground[observations.point])
-        solution = adjust_linearised(at)
+        solution = adjust_linearised(fitted_again(at) if refitted else at)
         step_px, step_m = np.abs(solution.theta - theta).max(), np.abs(solution.geocentric - ground).max()
         theta, ground = solution.theta, solution.geocentric
         if step_px < CONVERGED_PIXELS and step_m < CONVERGED_METRES:
@@ -231,7 +247,7 @@ def ray_statistics(observations: Observations, theta: Array) -> Array:
     o, sensor, every = observations, sensor_named("rpc"), np.arange(len(observations.point), dtype=np.int32)
     ground = o.origin
     for _ in range(10):
-        projection = sensor.project(o.cameras[o.image], theta[o.image], Ground.at(ground[o.point]), every, every, o.observed)
+        projection = sensor.project(o.cameras[o.image], theta[o.image], Ground.at(ground[o.point]), every, every, o.fitted)
         v = (o.observed - projection.image) / o.sigma
         b = projection.by_ground / o.sigma[:, :, None]
         normal, right = np.zeros((len(ground), 3, 3)), np.zeros((len(ground), 3))

@@ -157,11 +157,11 @@ def test_without_errors_the_truth_comes_back_exactly() -> None:
 
 def test_result_is_a_minimum_of_the_weighted_squares() -> None:
     block = simulate(3)
-    result = adjusted(block)
+    result, rays = adjusted(block), block.rays
+    fitted = block.images.project(result.theta, block.images.ground(result.ground), rays.image, rays.point, rays.observed).image
 
     def squares(theta: Array, ground: Array) -> float:
-        rays = block.rays
-        predicted = block.images.project(theta, block.images.ground(ground), rays.image, rays.point, rays.observed).image
+        predicted = block.images.project(theta, block.images.ground(ground), rays.image, rays.point, fitted).image
         u = np.linalg.pinv(block.images.prior.toarray()) @ theta.ravel()
         return float((((block.rays.observed - predicted) / block.rays.sigma) ** 2).sum() + u @ u)
 

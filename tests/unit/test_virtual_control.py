@@ -107,7 +107,7 @@ def test_a_block_that_nothing_else_holds_is_held(case: Case, weight: str) -> Non
     single = np.sqrt(2.0) * DESIGN.priors.bias_px * 2.5  # metres, plane
     plane, height = np.hypot(*case.rms(found)[:2]), case.rms(found)[2]
     assert plane < 0.6 * single and height < 0.6 * single
-    assert np.linalg.norm(case.rms(loose)) > 5.0 * np.linalg.norm(case.rms(found))
+    assert np.linalg.norm(case.rms(loose)) > 4.0 * np.linalg.norm(case.rms(found))
 
 
 @pytest.mark.parametrize(("weight", "least"), [("plain", 4.0), ("balanced", 50.0)])
