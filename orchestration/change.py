@@ -237,7 +237,8 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     arrivals, departures = move.registration.arrivals, move.out.departures
     tiles = _touched_tiles(cover, move.out, move.registration)
     shared = executor.share(list(move.images))
-    origins = _origins(move)
+    left, goes = _departures(move)
+    origins = _origins(left, goes)
     arguments = []
     # the largest first: at the end no worker is left with much to do while others wait
     for tile in sorted(tiles, key=lambda tile: -sum(len(arrivals[c].image) for c in move.cover.cells_held(tile) if c in arrivals)):
@@ -275,12 +276,11 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     no_more = {done.tile for done in factored if not done.images} | (split - {*base.cover.splits})
     gone += [f"{group}/{base.cover.tile_name(tile)}" for tile in sorted(no_more) for group in ("tiles", TILE_STATES)]
     rejected = _rejected_rays((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
-    return Settled(tuple(reports), _changes(base, move, reports, origins), frozenset(flags), tuple(gone), rejected)
+    return Settled(tuple(reports), _changes(base, move, reports, origins, left[goes < 0]), frozenset(flags), tuple(gone), rejected)
 
 
-def _origins(move: Move) -> dict[int, tuple[int, ...]]:
-    """For each cell at which points arrive from other cells that are still there: these cells."""
-    before, after = _departures(move)
+def _origins(before: NDArray[np.int64], after: NDArray[np.int64]) -> dict[int, tuple[int, ...]]:
+    """For each cell at which points arrive from other cells that are still there: these cells. Arguments as `_departures` gives them."""
     moved = (after >= 0) & (after != before)
     found: dict[int, tuple[int, ...]] = {}
     for to, origin in np.unique(np.column_stack([after[moved], before[moved]]), axis=0).tolist():
@@ -300,16 +300,17 @@ def _departures(move: Move) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return left, goes[place[len(ids) :]]
 
 
-def _changes(base: Snapshot, move: Move, reports: Sequence[TileReport], origins: Mapping[int, Sequence[int]]) -> Changes:
-    """What a move does to reconciled states (decision 014).
+def _changes(
+    base: Snapshot, move: Move, reports: Sequence[TileReport], origins: Mapping[int, Sequence[int]], bereaved: NDArray[np.int64]
+) -> Changes:
+    """What a move does to reconciled states (decision 014); ``bereaved`` are cells of points that have gone for good.
 
     A point that moves to a cell which a tile holds, from one that it does not, is in the tile's state already.
     """
     cover = move.cover
     lost = {report.tile for report in reports if report.lost}
     lost |= {base.cover.owner(c) for c in base.cell_numbers() if base.cover.cell_name(c) in move.out.dissolved}
-    before, after = _departures(move)
-    lost |= {cover.owner(c) for c in np.unique(before[after < 0]).tolist()}
+    lost |= {cover.owner(c) for c in np.unique(bereaved).tolist()}
     if any(report.lost_elsewhere for report in reports):
         lost.add(EVERYWHERE)
     stale = {tile for to, cells in origins.items() for c in cells for tile in set(cover.holders(to)) - set(cover.holders(c))}
