@@ -38,7 +38,8 @@ AGREE, SAMPLED = 1e-6, 1000
 STAGE_NAMES = ("catalogue simulated", "run, catalogue to committed network", "reconcile", "one more triplet, to its committed version")
 OVERLAP_KM = 0.0
 """Once tiles are reconciled an overlap adds nothing, and it costs: its rays are judged by every tile that holds them."""
-SEEDS = 6
+SEEDS = 20
+"""Most points of an area share their error: drawn from the stated covariance itself, one realisation has 89 % within CE90, plus or minus 13."""
 TENTH = 0.1
 WITHIN = (85.0, 95.0)
 """Per cent of check points within the stated CE90 and LE90, over all realisations."""
