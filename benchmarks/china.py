@@ -39,7 +39,7 @@ STAGE_NAMES = ("catalogue simulated", "run, catalogue to committed network", "re
 OVERLAP_KM = 0.0
 """Once tiles are reconciled an overlap adds nothing, and it costs: its rays are judged by every tile that holds them."""
 SEEDS = 20
-"""Most points of an area share their error: drawn from the stated covariance itself, one realisation has 89 % within CE90, plus or minus 13."""
+"""Most points of an area share their error: drawn from the stated covariance itself, one has 89 % within CE90, plus or minus 13."""
 TENTH = 0.1
 WITHIN = (85.0, 95.0)
 """Per cent of check points within the stated CE90 and LE90, over all realisations."""
