@@ -30,7 +30,7 @@ Index = NDArray[np.int32]
 Offsets = NDArray[np.int64]
 
 FITTED_SIGMAS = 5.0
-"""A residual that is no larger may be an error of measurement; that of a ray that is accepted is smaller."""
+"""A residual that is no larger may be an error of measurement. Where rays are judged that of an accepted one is smaller."""
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ class Projection:
 
 @dataclass(frozen=True)
 class Drift:
-    """What an adjustable parameter is another one times a factor that grows along the image: a polynomial, a rate times time.
+    """What an adjustable parameter is another one, no drift itself, times a factor that grows evenly along the image: a place, or time.
 
     Attributes
     ----------

@@ -112,7 +112,7 @@ class PushbroomSensor:
         return geodetic
 
     def drift_by_pixel(self, cameras: Array) -> Array:
-        """See `DriftingSensor.drift_by_pixel`: a rate acts on time, which passes with the lines, here at its mean rate."""
+        """See `DriftingSensor.drift_by_pixel`: a rate acts on time, which passes with the lines; here at the mean of their rates."""
         row, first = np.arange(len(cameras)), np.full(len(cameras), TABLES)
         last = TABLES + LINE_ROW * (cameras[:, LINES].astype(np.int64) - 1)
         seconds, lines = (cameras[row, last + k] - cameras[row, first + k] for k in range(2))

@@ -253,6 +253,21 @@ def test_with_measured_coordinates_a_rate_is_the_rotation_at_the_measured_line()
         np.testing.assert_allclose(by_rate[r], project(cameras, ground[r : r + 1], still).image[0], rtol=0.0, atol=1e-8)
 
 
+def test_the_factor_of_a_rate_grows_with_the_lines_as_it_says() -> None:
+    cameras, image = packed(), pixels(20)
+    ground = geodetic_to_geocentric(places(cameras, image))
+    here, later = (project(cameras, ground, at=image + np.array([0.0, lines])).by_parameters for lines in (0.0, 100.0))
+    by_pixel = SENSOR.drift_by_pixel(cameras)[0]
+    assert by_pixel[0] == 0.0
+    for k, parameter in enumerate(SENSOR.parameters):
+        if parameter.drift is None:
+            assert k < 3
+            np.testing.assert_allclose(later[:, :, k], here[:, :, k], rtol=1e-9, atol=1e-6)
+        else:
+            grown = 100.0 * by_pixel[parameter.drift.axis] * here[:, :, parameter.drift.of]
+            np.testing.assert_allclose(later[:, :, k] - here[:, :, k], grown, rtol=1e-6, atol=1e-6)
+
+
 def test_roll_moves_along_the_detector_pitch_across_it_and_yaw_about_the_line_of_sight() -> None:
     cameras = packed(description(effects={}))
     middle = np.array([[0.5 * (WIDTH - 1.0), 0.5 * (HEIGHT - 1.0)]])

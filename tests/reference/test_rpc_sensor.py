@@ -149,6 +149,23 @@ def test_bias_names_the_parameters_that_shift_the_whole_image() -> None:
     np.testing.assert_array_equal(by_parameters[:, :, [0, 3]], np.broadcast_to(np.eye(2), (400, 2, 2)))
 
 
+def test_the_factor_of_a_drift_grows_over_the_image_as_it_says() -> None:
+    cameras, ground = packed(simple_camera()), geodetic_to_geocentric(places(simple_camera(), 20))
+    every, measured = np.arange(20, dtype=np.int32), np.random.default_rng(2).uniform(0.0, 800.0, (20, 2))
+    by_pixel = RPC_SENSOR.drift_by_pixel(cameras)[0]
+    for axis in (0, 1):
+        here, there = (
+            RPC_SENSOR.project(cameras, CORRECTION, Ground.at(ground), 0 * every, every, measured + shift * np.eye(2)[axis]).by_parameters
+            for shift in (0.0, 100.0)
+        )
+        grown = np.zeros_like(here)
+        for k, parameter in enumerate(RPC_SENSOR.parameters):
+            if parameter.drift is not None and parameter.drift.axis == axis:
+                grown[:, :, k] = 100.0 * by_pixel[axis] * here[:, :, parameter.drift.of]
+        np.testing.assert_allclose(there - here, grown, rtol=0.0, atol=1e-12)
+        assert np.abs(grown).max() > 0.1
+
+
 def test_each_ray_takes_its_own_camera_correction_and_point(data: Path) -> None:
     cameras = np.concatenate([packed(real_camera(data, name)) for name in REAL[:3]])
     rng = np.random.default_rng(4)

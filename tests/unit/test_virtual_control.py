@@ -107,6 +107,7 @@ def test_a_block_that_nothing_else_holds_is_held(case: Case, weight: str) -> Non
     single = np.sqrt(2.0) * DESIGN.priors.bias_px * 2.5  # metres, plane
     plane, height = np.hypot(*case.rms(found)[:2]), case.rms(found)[2]
     assert plane < 0.6 * single and height < 0.6 * single
+    # 5 with drift at measured coordinates, which made the free block smaller than it is (decision 018)
     assert np.linalg.norm(case.rms(loose)) > 4.0 * np.linalg.norm(case.rms(found))
 
 
