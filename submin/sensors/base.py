@@ -131,5 +131,9 @@ class DriftingSensor(Sensor, Protocol):
     """A sensor some of whose parameters are a `Drift`."""
 
     def drift_by_pixel(self, cameras: Array) -> Array:
-        """By how much (m, 2) the factor of a drift grows a pixel, with the sample and with the line."""
+        """By how much (m, 2) the factor of a drift grows a pixel, with the sample and with the line.
+
+        ``cameras`` (m, c) are packed. The factor's unit is that of the other parameter over that of the drift: none, or seconds
+        (docs/decisions/018).
+        """
         ...
