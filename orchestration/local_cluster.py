@@ -11,14 +11,19 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import Any
 
+from orchestration.memory import seldom_collected
 from submin.query.warm_up import compile_kernels
 
 GIVEN_UP = 120.0
 """Seconds without a single worker after which none is waited for: a killed one comes again in a few, on a busy machine in tens of them."""
 LOOKED_EVERY = 1.0
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+# glibc: freed memory is used again as it is, not given to the system and zeroed anew (a tenth of all processor time); see `memory.give_back`
+MEMORY = {"MALLOC_ARENA_MAX": "1", "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(1 << 30)}
 SETTINGS = {
-    "distributed.nanny.pre-spawn-environ": THREADS,  # set before the workers load numpy
+    "distributed.nanny.pre-spawn-environ": {**THREADS, **MEMORY},  # set before the workers load numpy
+    # Dask would look at every stack a hundred times a second; what tasks took is in the run's record
+    "distributed.worker.profile.enabled": False,
     "distributed.worker.memory.terminate": False,
     # a killed worker may take long to come again where machines are busy; given up after this, it never would, and be waited for
     "distributed.deploy.lost-worker-timeout": "1 day",
@@ -35,13 +40,16 @@ def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
     import dask
     from distributed import Client, LocalCluster
 
+    from orchestration.worker_setup import SeldomCollected
+
     compile_kernels()
     with dask.config.set(SETTINGS):
         with _children_deaf_to_ctrl_c():
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL
             )  # fmt: skip
-        with cluster, Client(cluster) as client, _watched(cluster, client) as deserted:
+        with cluster, Client(cluster) as client, _watched(cluster, client) as deserted, seldom_collected():
+            client.register_plugin(SeldomCollected())
             yield client, deserted
 
 

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+SELDOM = (50_000, 50, 100)
+"""Thresholds of Python's garbage collector where many small objects live long: as they are it would walk through all of them at every turn."""
 
 
 def own_peak_memory_mb() -> float:
@@ -16,8 +22,28 @@ def own_peak_memory_mb() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
+def collect_seldom() -> None:
+    """Leave what exists now out of garbage collection, and look for garbage in cycles seldom; `give_back` looks for it."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*SELDOM)
+
+
+@contextmanager
+def seldom_collected() -> Iterator[None]:
+    """`collect_seldom` in the body."""
+    before = gc.get_threshold()
+    collect_seldom()
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+        gc.unfreeze()
+
+
 def give_back() -> None:
     """Give freed memory of this process back to the system, where its C library (glibc) can: what a batch leaves in pieces would stay."""
+    gc.collect()
     try:
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     except (OSError, AttributeError):

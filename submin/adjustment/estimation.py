@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import Sums
-from submin.adjustment.symmetric import between, fill_symmetric
+from submin.adjustment.symmetric import between, fill_symmetric, transposed_times
 from submin.errors import NumericalError
 
 Array = NDArray[np.float64]
@@ -147,7 +147,7 @@ def estimate_images(sums: Sums, prior: sp.csr_array, parameters: int) -> ImageEs
     if not prior.shape[1]:  # only images that have nothing to adjust
         return ImageEstimate(np.zeros((len(sums.vector) // parameters, parameters)), np.empty(0), sums.misclosure, np.empty((0, 0)), prior)
     factor = cholesky(reduced_information(sums.information, prior))
-    right = prior.T @ sums.vector
+    right = transposed_times(prior, sums.vector)
     u, _ = la.lapack.dpotrs(factor, right, lower=1)
     theta = np.asarray(prior @ u).reshape(-1, parameters)
     # f + |u|^2 at the minimum equals f - h'theta

@@ -16,6 +16,7 @@ Offsets = NDArray[np.int64]
 HEIGHT_SIGMA = 2000.0
 """Metres. A hold on the mean height, loose enough not to matter where rays converge, that keeps parallel rays from running away."""
 ITERATIONS = 8
+SETTLED_METRES = 1e-3
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -85,13 +86,17 @@ def intersect(images: ImageSet, rays: Rays, points: int) -> Array:
     up[~reached] = 0.0
     held = ground.copy()
     theta = np.zeros((len(images), images.parameters))
-    moving = reached.copy()
+    moving, before = reached.copy(), np.zeros(points)
     for _ in range(ITERATIONS):
         projection = images.project(theta, images.ground(ground), rays.image, rays.point)
         step = _steps(first, projection.image, projection.by_ground, rays.observed, rays.sigma, up / HEIGHT_SIGMA, held - ground)
         step[~(np.isfinite(step).all(axis=1) & moving)] = 0.0  # each point stops by itself: its company must not matter
         ground = ground + step
-        moving &= np.abs(step).max(axis=1) >= 1e-3
+        length = np.abs(step).max(axis=1)
+        # steps shrink at least as the last one has: where the next one is known to be short it need not be made
+        shrinks = np.where(length < before, length / np.maximum(before, SETTLED_METRES), 1.0)
+        moving &= length * shrinks >= SETTLED_METRES
+        before = length
         if not moving.any():
             break
     ground[~reached] = np.nan

@@ -399,7 +399,8 @@ class _Entries:
         """The whole matrix, without stored zeros."""
         if not self._rows:
             return sp.csr_array(shape)
-        at = np.concatenate(self._rows), np.concatenate(self._columns)
-        matrix = sp.coo_array((np.concatenate(self._values), at), shape=shape).tocsr()
-        matrix.eliminate_zeros()
-        return matrix
+        rows, columns, values = (np.concatenate(parts) for parts in (self._rows, self._columns, self._values))
+        order = np.lexsort((columns, rows))
+        order = order[values[order] != 0.0]
+        starts = np.cumsum(np.bincount(rows + 1, weights=values != 0.0, minlength=shape[0] + 1)).astype(np.int32)
+        return sp.csr_array((values[order], columns[order].astype(np.int32), starts), shape=shape)

@@ -114,6 +114,20 @@ def between(factor: sp.csr_array, full: Array, *, transposed: bool = False) -> A
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _transposed_times(first: NDArray[np.int32], column: NDArray[np.int32], value: Array, vector: Array, out: Array) -> None:
+    for i in range(len(vector)):
+        for a in range(first[i], first[i + 1]):
+            out[column[a]] += value[a] * vector[i]
+
+
+def transposed_times(factor: sp.csr_array, vector: Array) -> Array:
+    """``C' x`` (q,) of a factor C (n, q) with few entries and a vector (n,), without a transposed factor."""
+    out = np.zeros(factor.shape[1])
+    _transposed_times(factor.indptr, factor.indices, factor.data, vector, out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _pack(lower: Array, out: Array) -> None:
     k = 0
     for i in range(len(lower)):

@@ -16,6 +16,7 @@ from submin.adjustment.priors import APriori, ImagePrior, JointRows
 from submin.errors import InputError, StoreError
 from submin.geodesy import WGS84, Ellipsoid
 from submin.sensors import sensor_named
+from submin.sensors.description import camera_values
 from submin.sensors.footprint import ground_pixels
 from submin.sensors.rpc import image_centres
 
@@ -80,7 +81,7 @@ _JOINT = "joint"
 
 @lru_cache(maxsize=CAMERAS_KEPT)
 def _packed(sensor: str, camera: str, width: int, height: int) -> NDArray[np.float64]:
-    return sensor_named(sensor).pack(json.loads(camera), width, height)
+    return sensor_named(sensor).pack(camera_values(camera), width, height)
 
 
 class CatalogueImage(Protocol):

@@ -25,6 +25,7 @@ from submin.errors import CatalogueError, InputError
 from submin.geodesy import WGS84, Ellipsoid
 from submin.network.id_numbers import numbered
 from submin.sensors import sensor_named
+from submin.sensors.description import camera_values
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -213,7 +214,7 @@ class ImageRecord:
             Naming the image, when the sensor is unknown, the text is not JSON, or the sensor model refuses it.
         """
         try:
-            camera = json.loads(self.camera)
+            camera = camera_values(self.camera)
             if not isinstance(camera, dict):
                 raise InputError(f"camera is {type(camera).__name__}; expected a JSON object")
             return sensor_named(self.sensor).pack(camera, self.width, self.height)
@@ -227,7 +228,7 @@ class ImageRecord:
     @property
     def _content(self) -> dict[str, Any]:
         try:
-            camera = json.loads(self.camera)
+            camera = camera_values(self.camera)
         except json.JSONDecodeError:
             camera = self.camera
         return {
@@ -374,7 +375,7 @@ def defects(block: Block) -> str | None:
 
 def _first_pixels(images: Sequence[ImageRecord], name: str) -> Array:
     """Sample or line (m,) of the first pixel of each image: of an RPC, in the pixel frame that it states."""
-    cameras = [json.loads(image.camera) if image.sensor == "rpc" else {} for image in images]
+    cameras = [camera_values(image.camera) if image.sensor == "rpc" else {} for image in images]
     return np.array([float(camera.get("origin", (0.0, 0.0))[name == "line"]) for camera in cameras])
 
 
