@@ -112,13 +112,13 @@ class Registration:
     ----------
     arrivals : points by cell, with all of their rays
     directory : ids and cells of all points
-    passing : (r, 3) metres by which each ray passes the place of its point, and on which side; infinite where a camera reaches no ground
+    apart : (n,) metres between the places to which the accepted rays of each point point; infinite where a camera reaches no ground
     outside : (r,) True for rays on points outside the cover's rectangle
     """
 
     arrivals: dict[int, RegisteredPoints]
     directory: tuple[Ids, NDArray[np.int64]]
-    passing: Array
+    apart: Array
     outside: Flags
 
 
@@ -129,13 +129,13 @@ class Located:
     Attributes
     ----------
     origin : (n, 3) geocentric metres, NaN where a camera reaches no ground; cell : (n,) number, -1 there
-    outside : (n,) True for points outside the cover's rectangle; passing : (r, 3) of their rays, see `Registration`
+    outside : (n,) True for points outside the cover's rectangle; apart : (n,), see `Registration`
     """
 
     origin: Array
     cell: NDArray[np.int64]
     outside: Flags
-    passing: Array
+    apart: Array
 
 
 def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cover: Cover) -> Registration:
@@ -151,7 +151,7 @@ def locate(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cov
     point, points = rays.point, len(rays.ids)
     at, outside = np.full(points, -1, dtype=np.int64), np.zeros(points, dtype=np.bool_)
     if not len(rays):
-        return Located(np.empty((0, 3)), at, outside, np.empty((0, 3)))
+        return Located(np.empty((0, 3)), at, outside, np.empty(0))
     named = np.argsort(np.array(images.ids, dtype=np.str_))
     rank = np.empty(len(named), dtype=np.int32)
     rank[named] = np.arange(len(named))
@@ -168,7 +168,9 @@ def locate(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cov
     passing = np.full((len(point), 3), np.inf)
     if usable.any():
         passing[usable] = _passing(images, local[usable], rays.observed[usable], compact[point[usable]], origin[reached])
-    return Located(origin, at, outside, passing)
+    # only rays count that were accepted when last judged: a blunder that stage 1 has found is no second place
+    counts = rays.accepted | ~np.isfinite(passing).all(axis=1)
+    return Located(origin, at, outside, _apart(point[counts], passing[counts], points))
 
 
 def arranged(rays: LooseRays, located: Located) -> Registration:
@@ -186,7 +188,7 @@ def arranged(rays: LooseRays, located: Located) -> Registration:
             arrivals[number] = RegisteredPoints(
                 ids[members], located.origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
             )
-    return Registration(arrivals, (ids, at), located.passing, located.outside[point])
+    return Registration(arrivals, (ids, at), located.apart, located.outside[point])
 
 
 def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
@@ -195,17 +197,13 @@ def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
     return np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part, minlength=parts))[:-1])
 
 
-def joined(parts: Sequence[Located], rows: Sequence[NDArray[np.int64]]) -> Located:
-    """Where all points are registered, from parts of their rays, whose rows are those of `by_points`."""
-    passing = np.empty((sum(map(len, rows)), 3))
-    for part, of_part in zip(parts, rows, strict=True):
-        passing[of_part] = part.passing
-    origin, cell, outside = (np.concatenate([getattr(part, name) for part in parts]) for name in ("origin", "cell", "outside"))
-    return Located(origin, cell, outside, passing)
+def joined(parts: Sequence[Located]) -> Located:
+    """Where all points are registered, from what was found for parts of their rays as `by_points` makes them."""
+    return Located(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Located)))
 
 
 def _passing(images: ImageSet, image: NDArray[np.int32], observed: Array, point: NDArray[np.int64], origin: Array) -> Array:
-    """Metres (r, 3) by which rays pass their points, each in the plane across it."""
+    """Metres (r, 3) by which rays pass the places of their points, and on which side, each in the plane across it."""
     theta = np.zeros((len(images), images.parameters))
     projection = images.project(theta, images.ground(origin), image, point.astype(np.int32))
     b = projection.by_ground
@@ -220,11 +218,10 @@ def contradictions(
     """Blocks of a batch that measure a point elsewhere than the network or the blocks before them, with the point and how far off, metres.
 
     Blocks are taken in their order, and one that contradicts is left out for those after it: the same as one at a time. Only rays count
-    that were accepted when last judged: a blunder that stage 1 has found is no second place. Arguments as of `register`, and its result.
+    that were accepted when last judged, or reach no ground. Arguments as of `register`, and its result.
     """
-    counts = rays.accepted | ~np.isfinite(registration.passing).all(axis=1)
-    apart = _apart(rays.point[counts], registration.passing[counts], len(rays.ids))
-    doubtful = rays.take(counts & (apart > SAME_POINT_METRES)[rays.point])
+    apart = registration.apart
+    doubtful = rays.take((rays.accepted | ~np.isfinite(apart)[rays.point]) & (apart > SAME_POINT_METRES)[rays.point])
     most = _most_apart(doubtful, images, image_rows)
     kept = doubtful.block == IN_THE_NETWORK
     found: dict[int, tuple[str, float]] = {}
@@ -232,7 +229,7 @@ def contradictions(
         mine = doubtful.block == block
         now = (kept | mine) & np.isin(doubtful.point, doubtful.point[mine])
         together_now, points = doubtful.take(now), np.unique(doubtful.point[now])
-        apart = _apart(together_now.point, register(together_now, images, image_rows, cover).passing, len(points))
+        apart = register(together_now, images, image_rows, cover).apart
         too_far = apart - most[points]
         worst = int(np.argmax(too_far))
         if too_far[worst] > 0.0:

@@ -110,13 +110,6 @@ def arriving(ids: Sequence[str], ground: Array, images: Sequence[int], block: in
 NOTHING = together([])
 
 
-def apart(registration: Registration, ids: Sequence[str] | NDArray[np.str_] | None = None) -> Array:
-    """Metres between the places to which the rays of the point of each ray point; without ids all are of one point."""
-    names = np.zeros(len(registration.passing), dtype="U1") if ids is None else np.asarray(ids)
-    spread = [np.ptp(registration.passing[names == name], axis=0) for name in names]
-    return np.linalg.norm(np.array(spread), axis=1)
-
-
 @dataclass
 class Fused:
     """Cells and directory of a network, changed as a run and a withdrawal do it, but without a store.
@@ -255,7 +248,7 @@ def test_position_comes_from_all_rays() -> None:
         assert cell.number == cell_at(ground[k])
         np.testing.assert_array_equal(cell.linearised_at[row], cell.origin[row])
     assert len(fused.cells) > 1
-    assert apart(registration, np.tile(ids, 3)).max() < 4.0
+    assert registration.apart.max() < 4.0
     assert not registration.outside.any()
     assert registration.directory[0].tolist() == ids
 
@@ -284,7 +277,7 @@ def test_single_ray_is_registered_at_the_mean_height_and_pending() -> None:
     assert cell.number == cell_at(fused.origin("p")) != cell_at(THERE[0])
     # a pending point is in its cell, and says nothing
     assert cell.sums.redundancy == 0 and not cell.sums.information.any() and not cell.sums.vector.any()
-    assert apart(registration)[0] < 1e-6
+    assert registration.apart[0] < 1e-6
 
 
 def test_pending_point_moves_with_its_second_ray_and_takes_the_first_along_once() -> None:
@@ -350,7 +343,7 @@ def test_registration_is_never_final() -> None:
     assert cell.number == cell_at(fused.origin("p"))
     assert np.linalg.norm(fused.origin("p") - origin) > 50.0
     assert len(fused.rays_of("p")) == 3
-    assert 200.0 < apart(registration)[0] < SAME_POINT_METRES
+    assert 200.0 < registration.apart[0] < SAME_POINT_METRES
     fused.withdraw([2])
     assert fused.cell_of("p")[0].number == number
     np.testing.assert_array_equal(fused.origin("p"), origin)
@@ -399,7 +392,7 @@ def test_row_of_an_image_in_the_network_leaves_no_trace() -> None:
         found = register(moved, IMAGES.take(order), rows, COVER)
         np.testing.assert_array_equal(found.directory[0], expected.directory[0])
         np.testing.assert_array_equal(found.directory[1], expected.directory[1])
-        np.testing.assert_array_equal(found.passing, expected.passing)
+        np.testing.assert_array_equal(found.apart, expected.apart)
         assert found.arrivals.keys() == expected.arrivals.keys()
         for number, points in found.arrivals.items():
             np.testing.assert_array_equal(points.origin, expected.arrivals[number].origin)
@@ -520,7 +513,7 @@ def test_company_does_not_matter(seed: int) -> None:
         alone = register(rays.take(mine), IMAGES, ROWS, COVER)
         assert alone.directory[1].tolist() == list(alone.arrivals) == [number]
         np.testing.assert_array_equal(alone.arrivals[int(number)].origin[0], origin[str(point)])
-        np.testing.assert_array_equal(alone.passing, whole.passing[mine])
+        np.testing.assert_array_equal(alone.apart, whole.apart[whole.directory[0] == point])
         np.testing.assert_array_equal(alone.outside, whole.outside[mine])
 
 
@@ -531,8 +524,8 @@ def test_parts_put_together_are_the_whole(seed: int, parts: int) -> None:
     whole = register(rays, IMAGES, ROWS, COVER)
     rows = by_points(rays, parts)
     assert sorted(np.concatenate(rows).tolist()) == list(range(len(rays)))
-    found = arranged(rays, joined([locate(rays.take(part), IMAGES, ROWS, COVER) for part in rows], rows))
-    for name in ("passing", "outside"):
+    found = arranged(rays, joined([locate(rays.take(part), IMAGES, ROWS, COVER) for part in rows]))
+    for name in ("apart", "outside"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
     for k in range(2):
         np.testing.assert_array_equal(found.directory[k], whole.directory[k])
@@ -598,7 +591,7 @@ def test_two_rays_of_two_places_are_as_far_apart_as_they_pass_each_other(
     images = image_set(views)
     registration = register(rays_at(images, [places([0.0], [0.0]), places([east], [north], 400.0 + up)], sigma), images, ROWS[:2], COVER)
     expected = distance_of_rays(np.zeros(3), np.array([east, north, up]), views)
-    np.testing.assert_allclose(apart(registration), expected, rtol=5e-3)
+    np.testing.assert_allclose(registration.apart, expected, rtol=5e-3)
 
 
 @pytest.mark.parametrize(("here", "there"), [(1, 1), (1, 5), (2, 3), (2, 12), (9, 2), (6, 6)])
@@ -608,7 +601,7 @@ def test_two_places_are_as_far_apart_however_many_rays_see_each(here: int, there
     images = image_set([((-0.1, 0.1)[k % 2], 0.0) for k in range(count)], [f"image {k:02d}" for k in range(count)])
     rows = np.arange(ROW, ROW + count, dtype=np.int32)
     grounds = [places([0.0], [0.0])] * here + [places([0.0], [800.0])] * there
-    np.testing.assert_allclose(apart(register(rays_at(images, grounds), images, rows, COVER)), 800.0, rtol=5e-3)
+    np.testing.assert_allclose(register(rays_at(images, grounds), images, rows, COVER).apart, 800.0, rtol=5e-3)
 
 
 def contradicting(rays: LooseRays) -> dict[int, tuple[str, float]]:
@@ -637,13 +630,12 @@ def test_a_blunder_that_stage_one_has_found_is_no_second_place() -> None:
     assert not contradicting(rays)
 
 
-def test_apart_is_told_to_every_ray_of_the_point_and_to_no_other() -> None:
+def test_apart_is_told_of_the_point_and_of_no_other() -> None:
     far = places([3000.0], [-2500.0])
     rays = together([arriving(["p"], THERE, [0, 1]), arriving(["q", "r"], np.concatenate([THERE, far]), [0, 1, 2], block=1),
                      arriving(["p"], far, [2, 3], block=2)])  # fmt: skip
     registration = register(rays, IMAGES, ROWS, COVER)
-    of_p = rays.point_ids == "p"
-    told = apart(registration, rays.point_ids)
+    of_p, told = registration.directory[0] == "p", registration.apart
     assert told[of_p].min() > SAME_POINT_METRES
     assert told[~of_p].max() < 4.0
     ((block, (point, metres)),) = contradictions(rays, registration, IMAGES, ROWS, COVER).items()
@@ -674,15 +666,15 @@ def test_rays_of_a_known_point_elsewhere_are_apart_from_those_in_the_network(ray
     registration = fused.add(arriving(["p"], far, [2, 3][:rays_there]))
     # views that lean to all sides spread further, as no one height suits them
     distance = np.hypot(2280.0, 2000.0)
-    told = apart(registration)
+    told = registration.apart
     assert distance < told.min() <= told.max() < most * distance
-    assert told.shape == (3 + rays_there,)
+    assert told.shape == (1,)
 
 
 def test_a_single_ray_is_not_apart_from_itself_wherever_it_lies() -> None:
     ground = places([20.0, 900.0, -5000.0], [30.0, -100.0, 6000.0])
     registration = register(arriving(["p", "q", "r"], ground, [1]), IMAGES, ROWS, COVER)
-    np.testing.assert_allclose(apart(registration, ["p", "q", "r"]), 0.0, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(registration.apart, 0.0, rtol=0.0, atol=1e-6)
 
 
 def unreachable() -> ImageSet:
@@ -696,7 +688,7 @@ def test_rays_that_reach_no_ground_go_nowhere() -> None:
     rays = arriving(["lost", "p"], np.concatenate([THERE, THERE]), [0])
     bad = replace(rays, image=np.array([ROW + 1, ROW], dtype=np.int32), observed=np.array([[9500.0, 5000.0], rays.observed[1]]))
     registration = register(bad, unreachable(), ROWS, COVER)
-    assert np.isinf(registration.passing[0]).all() and np.abs(registration.passing[1]).max() < 1.0
+    assert np.isinf(registration.apart[0]) and registration.apart[1] == 0.0
     assert not registration.outside.any()
     assert [new.point_ids.tolist() for new in registration.arrivals.values()] == [["p"]]
     assert registration.directory[0].tolist() == ["lost", "p"]
@@ -706,14 +698,14 @@ def test_rays_that_reach_no_ground_go_nowhere() -> None:
 def test_nothing_but_rays_that_reach_no_ground() -> None:
     rays = replace(arriving(["lost"], THERE, [1]), observed=np.array([[9500.0, 5000.0]]))
     registration = register(rays, unreachable(), ROWS, COVER)
-    assert np.isinf(registration.passing).all() and not registration.arrivals
+    assert np.isinf(registration.apart).all() and not registration.arrivals
     assert registration.directory[1].tolist() == [-1]
 
 
 def test_no_rays_are_registered_nowhere() -> None:
     registration = register(NOTHING, IMAGES.take([]), ROWS[:0], COVER)
     assert not registration.arrivals
-    assert [len(part) for part in (*registration.directory, registration.passing, registration.outside)] == [0] * 4
+    assert [len(part) for part in (*registration.directory, registration.apart, registration.outside)] == [0] * 4
 
 
 def test_points_outside_the_area_are_marked_and_belong_to_the_nearest_core() -> None:
