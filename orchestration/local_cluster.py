@@ -18,7 +18,7 @@ GIVEN_UP = 120.0
 """Seconds without a single worker after which none is waited for: a killed one comes again in a few, on a busy machine in tens of them."""
 LOOKED_EVERY = 1.0
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-# glibc: freed memory is used again as it is, not given to the system and zeroed anew (a tenth of all processor time); see `memory.give_back`
+# glibc: freed memory is used again as it is, not given to the system and zeroed anew (a tenth of all work); see `memory.give_back`
 MEMORY = {"MALLOC_ARENA_MAX": "1", "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(1 << 30)}
 SETTINGS = {
     "distributed.nanny.pre-spawn-environ": {**THREADS, **MEMORY},  # set before the workers load numpy

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 SELDOM = (50_000, 50, 100)
-"""Thresholds of Python's garbage collector where many small objects live long: as they are it would walk through all of them at every turn."""
+"""Thresholds of the garbage collector where many small objects live long: with its own it would walk through all of them every time."""
 
 
 def own_peak_memory_mb() -> float:
