@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import Any, TypeVar
 
 import numpy as np
 import zarr
@@ -28,9 +29,10 @@ from submin.storage.ledger import UNTESTED, Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 from submin.tiling.cover import Cover
 
+T = TypeVar("T")
 ImagesOf = Mapping[str, tuple[NetworkImage, ...]]
 
-BLOCKS_A_TASK = 8
+BLOCKS_A_TASK = 16
 LEAST_AGREEING = 0.5
 """Part of a block's rays that its own adjustment must accept: fewer are no blunders in a good block."""
 
@@ -152,14 +154,13 @@ def _stage_one(
     of_images = [block for block in blocks if block.kind == "images"]
     groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
     gates = _gates(groups, base)
-    arguments = [
-        ([block_rays(b, images[b.block_id]) for b in group], base.metadata.ellipsoid, gate)
-        for group, gate in zip(groups, gates, strict=True)
-    ]
+    arguments: Sequence[tuple[list[BlockRays], Ellipsoid, Gate | None]] = _OnDemand(
+        lambda k: ([block_rays(b, images[b.block_id]) for b in groups[k]], base.metadata.ellipsoid, gates[k]), len(groups)
+    )
     outcomes = executor.attempt_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
     for k, outcome in enumerate(outcomes):
         if isinstance(outcome, KilledTaskError):
-            outcomes[k] = _one_at_a_time(*arguments[k], executor)
+            outcomes[k] = _one_at_a_time(arguments[k], executor)
     accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if b.kind != "images"}
     tests: dict[str, BlockTest] = {}
     for outcome in (outcome for group in outcomes for outcome in group):
@@ -173,8 +174,24 @@ def _stage_one(
     return accepted, tests
 
 
-def _one_at_a_time(blocks: Sequence[BlockRays], ellipsoid: Ellipsoid, gate: Gate | None, executor: Executor) -> list[BlockAdjustment]:
+class _OnDemand(Sequence[T]):
+    """Values that are made when they are asked for, each time anew: what tasks are given, while others run already."""
+
+    def __init__(self, make: Callable[[int], T], count: int) -> None:
+        self._make, self._count = make, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, k: Any) -> Any:
+        if not 0 <= k < self._count:
+            raise IndexError(k)
+        return self._make(k)
+
+
+def _one_at_a_time(task: tuple[list[BlockRays], Ellipsoid, Gate | None], executor: Executor) -> list[BlockAdjustment]:
     """Stage 1 of blocks whose task killed its workers, each with nothing beside it: what kills them then is that block."""
+    blocks, ellipsoid, gate = task
     done = []
     for k, block in enumerate(blocks):
         alone = None if gate is None else Gate(gate.snapshot, gate.cells[k : k + 1])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import icechunk
 import numpy as np
@@ -148,7 +149,7 @@ def take_points_seen(base: Snapshot, images: Index) -> TakenOut:
 
 def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequence[NetworkImage], executor: Executor) -> Move:
     """Register the points taken out with their remaining and arriving rays; split the tiles that would then hold too many images."""
-    cover, stored = base.cover, Stored.of(base)
+    cover, stored = base.cover, Stored(base)
     parameters = max(base.metadata.parameters, width_of(image.sensor for image in new_images))
     while True:
         rays = together([arriving, out.rays])
@@ -182,16 +183,19 @@ def _touched_tiles(cover: Cover, out: TakenOut, registration: Registration) -> l
 
 @dataclass(frozen=True)
 class Stored:
-    """What a version has, listed once: its tiles, and its cells by name."""
+    """What a version has, listed when first asked for, and once: its tiles, and its cells by name."""
 
     base: Snapshot
-    tiles: frozenset[int]
-    cells: dict[str, int]
 
-    @classmethod
-    def of(cls, base: Snapshot) -> Stored:
-        """Of a version."""
-        return cls(base, frozenset(base.tile_numbers()), {base.cover.cell_name(c): c for c in base.cell_numbers()})
+    @cached_property
+    def tiles(self) -> frozenset[int]:
+        """Tiles that have a sub-MIN."""
+        return frozenset(self.base.tile_numbers())
+
+    @cached_property
+    def cells(self) -> dict[str, int]:
+        """Cells that hold points."""
+        return {self.base.cover.cell_name(c): c for c in self.base.cell_numbers()}
 
 
 def _overfull(stored: Stored, cover: Cover, parameters: int, tile: int, out: TakenOut, registration: Registration) -> bool:

@@ -40,7 +40,7 @@ def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
     import dask
     from distributed import Client, LocalCluster
 
-    from orchestration.worker_setup import SeldomCollected
+    from orchestration.worker_setup import Prepared
 
     compile_kernels()
     with dask.config.set(SETTINGS):
@@ -49,7 +49,7 @@ def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL
             )  # fmt: skip
         with cluster, Client(cluster) as client, _watched(cluster, client) as deserted, seldom_collected():
-            client.register_plugin(SeldomCollected())
+            client.register_plugin(Prepared())
             yield client, deserted
 
 

@@ -200,13 +200,14 @@ def fuse_blocks(
         before = Snapshot.open(place)
         tally = Tally(before.number, {row for _, row in before.flags()})
         new = _new_blocks(blocks, Ledger.of(before), tally, reporter)
-        for batch in batches_ahead(_with_images(new), max(batch_blocks, 1)):
+        for number, batch in enumerate(batches_ahead(_with_images(new), max(batch_blocks, 1))):
+            if number:
+                executor.give_back()
             good = [known.block for known in batch if known.reason is None]
             refused = [Rejected.of(known.block, known.reason) for known in batch if known.reason is not None]
             images = {known.block.block_id: known.images for known in batch}
             tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points))
             reporter.fused(len(batch))
-            executor.give_back()
     return tally
 
 

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import threading
+from importlib import import_module
 from typing import Any
 
 from distributed import WorkerPlugin
 
 from orchestration.memory import collect_seldom
+from submin.query.warm_up import compile_kernels
 
 
-class SeldomCollected(WorkerPlugin):
-    """Workers, also those that come again, look for garbage in cycles as seldom as their coordinator."""
+class Prepared(WorkerPlugin):
+    """Workers, also those that come again, load what tasks need before the first one comes, and then look for garbage seldom."""
 
     def setup(self, worker: Any) -> None:
-        """Called by Dask in each worker."""
-        collect_seldom()
+        """Called by Dask in each worker; a thread does it, so that nobody waits: the coordinator reads the catalogue meanwhile."""
+        threading.Thread(target=_prepare, name="prepare", daemon=True).start()
+
+
+def _prepare() -> None:
+    import_module("orchestration.tasks")
+    compile_kernels()
+    collect_seldom()

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 _FNV_OFFSET, _FNV_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
+SIEVE = 64
+"""Places of the sieve for each id that is looked for: as many in a hundred of all other points pass it."""
+LARGEST_SIEVE = 1 << 24
 
 
 def hash_ids(ids: NDArray[np.str_]) -> NDArray[np.uint64]:
@@ -26,3 +30,26 @@ def _letters(ids: NDArray[np.str_]) -> tuple[NDArray[np.unsignedinteger], NDArra
         return points, np.char.str_len(ids)
     encoded = np.char.encode(ids, "utf-8")
     return encoded.view(np.uint8).reshape(len(ids), -1), np.char.str_len(encoded)
+
+
+def look_up(entries: NDArray[np.uint64], values: NDArray[np.int64], wanted: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """The value (n,) of the last entry of each wanted hash (ascending), -1 where there is none; ``entries`` (k,) are in any order."""
+    found = np.full(len(wanted), -1, dtype=np.int64)
+    _look_up(entries, values, wanted, min(1 << (SIEVE * len(wanted)).bit_length(), LARGEST_SIEVE), found)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _look_up(
+    entries: NDArray[np.uint64], values: NDArray[np.int64], wanted: NDArray[np.uint64], places: int, found: NDArray[np.int64]
+) -> None:
+    """Nearly all entries are of hashes that nobody wants, and one look at a few of their bits tells."""
+    bits = np.uint64(places - 1)
+    sieve = np.zeros(places, np.bool_)
+    for k in range(len(wanted)):
+        sieve[wanted[k] & bits] = True
+    for k in range(len(entries)):
+        if sieve[entries[k] & bits]:
+            at = np.searchsorted(wanted, entries[k])
+            if at < len(wanted) and wanted[at] == entries[k]:
+                found[at] = values[k]

@@ -13,6 +13,7 @@ from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
 from submin.adjustment.rays import sorted_rays
 from submin.adjustment.symmetric import DENSE_SIZE, add_into, between, fill_symmetric, packed, permuted, unpacked
+from submin.network.id_hash import hash_ids, look_up
 from submin.network.sub_min import GroundPart, loadings
 from submin.query.spread import spread_rows
 from submin.sensors import sensor_named
@@ -48,6 +49,7 @@ def compile_kernels() -> None:
     loadings([GroundPart(ground, linear, point_factors(linear, np.ones(4)))], np.arange(2, dtype=np.int32), images.parameters)
     unpacked(packed(np.eye(2)))
     spread_rows(np.arange(6.0).reshape(3, 2), np.ones(3), np.array(["a", "b", "c"]), 2)
+    look_up(hash_ids(np.array(["a"])), np.zeros(1, dtype=np.int64), hash_ids(np.array(["a"])))
     variances_of(np.eye(2, order="F"), sp.eye_array(2, format="csr"))
     # the sums of a tile are large and sparse, which those of two images are not
     many = DENSE_SIZE + 1

@@ -303,23 +303,27 @@ def append_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
     kinds = attributes_of(group)["columns"]
     if set(kinds) != set(columns):
         raise ValueError(f"columns are {sorted(columns)}; expected {sorted(kinds)}")
-    for column, values in columns.items():
-        if not len(values):
-            continue
-        if kinds[column] == "text":
-            data, ends = encode_text(values)
-            base = array_of(group, column).shape[0]
-            if data.size:
-                _append(group, column, data)
-            _append(group, column + ".ends", ends + base)
-        else:
-            _append(group, column, values.astype(kinds[column]))
+
+    async def one(column: str, values: AnyArray) -> None:
+        if kinds[column] != "text":
+            await _append(await _array(group._async_group, column), values.astype(kinds[column]))
+            return
+        data, ends = encode_text(values)
+        letters = await _array(group._async_group, column)
+        ends = ends + letters.shape[0]
+        if data.size:
+            await _append(letters, data)
+        await _append(await _array(group._async_group, column + ".ends"), ends)
+
+    async def every() -> None:
+        await _side_by_side(one(column, values) for column, values in columns.items() if len(values))
+
+    sync(every())
 
 
-def _append(group: zarr.Group, name: str, values: AnyArray) -> None:
-    array = array_of(group, name)
+async def _append(array: zarr.AsyncArray[Any], values: AnyArray) -> None:
     with sound_chunks(array.path):  # the last chunk is read, and written with more in it
-        array.append(values)
+        await array.append(values)
 
 
 def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: int = 0, stop: int | None = None) -> dict[str, AnyArray]:

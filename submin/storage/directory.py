@@ -7,11 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from submin.storage.arrays import hash_ids
-
-SIEVE = 64
-"""Places of the sieve for each id that is looked for: as many in a hundred of all other points pass it."""
-LARGEST_SIEVE = 1 << 24
+from submin.network.id_hash import hash_ids, look_up
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +27,4 @@ class Directory:
         if not len(self.hash) or not len(point_ids):
             return np.full(len(point_ids), -1, dtype=np.int64)
         wanted, inverse = np.unique(hash_ids(point_ids), return_inverse=True)
-        # nearly all entries are of other points, and one look at a few bits of the hash tells
-        places = min(1 << (SIEVE * len(wanted)).bit_length(), LARGEST_SIEVE)
-        bits = np.uint64(places - 1)
-        sieve = np.zeros(places, dtype=np.bool_)
-        sieve[wanted & bits] = True
-        near = np.flatnonzero(sieve[self.hash & bits])
-        at = np.minimum(np.searchsorted(wanted, self.hash[near]), len(wanted) - 1)
-        hit = wanted[at] == self.hash[near]
-        found = np.full(len(wanted), -1, dtype=np.int64)
-        found[at[hit]] = self.cell[near[hit]]  # entries are in order of arrival, and the last assignment stays
-        return found[inverse]
+        return look_up(self.hash, self.cell, wanted)[inverse]
