@@ -30,6 +30,8 @@ Ids = NDArray[np.str_]
 Rows = NDArray[np.int64]
 
 LEAST_WEIGHT = 1e-6
+ROUND_OFF = 1e-9
+"""Part of a trace that tells nothing: near the least weight six digits cancel, and of two equal sets every weight is as good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +153,11 @@ class _Split:
         return float(mine + theirs)
 
     def best_weight(self) -> float:
-        """The weight of the least trace."""
+        """The weight of the least trace; of those that are as good but for round-off the one nearest to the middle."""
         found = minimize_scalar(self.trace, bounds=(LEAST_WEIGHT, 1.0 - LEAST_WEIGHT), method="bounded", options={"xatol": 1e-9})
-        return min((float(found.x), LEAST_WEIGHT, 1.0 - LEAST_WEIGHT), key=self.trace)
+        traces = {weight: self.trace(weight) for weight in (float(found.x), LEAST_WEIGHT, 0.5, 1.0 - LEAST_WEIGHT)}
+        good = (1.0 + ROUND_OFF) * min(traces.values())
+        return min((weight for weight, trace in traces.items() if trace <= good), key=lambda weight: abs(weight - 0.5))
 
     def union(self, weight: float, new: Rows, difference: Array) -> tuple[Array, Array]:
         """Corrections (m,) and covariance (m, m) of all coordinates of the first set and the new ones of the other."""

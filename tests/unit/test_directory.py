@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from submin.storage import directory
+from submin.network import id_hash
 from submin.storage.arrays import hash_ids
 from submin.storage.directory import Directory
 
@@ -17,7 +17,7 @@ def made(ids: np.ndarray, cells: np.ndarray) -> Directory:
 @pytest.mark.parametrize("wanted", [1, 30, 4000])
 @pytest.mark.parametrize("largest_sieve", [1 << 24, 1 << 6])
 def test_every_point_is_found_where_it_came_last(wanted: int, largest_sieve: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(directory, "LARGEST_SIEVE", largest_sieve)
+    monkeypatch.setattr(id_hash, "LARGEST_SIEVE", largest_sieve)
     rng = np.random.default_rng(wanted)
     ids = np.array([f"P{k:05d}" for k in rng.integers(0, 3000, 5000)])
     cells = rng.integers(0, 900, len(ids))
