@@ -313,7 +313,8 @@ def _changes(
     """
     cover = move.cover
     lost = {report.tile for report in reports if report.lost}
-    lost |= {base.cover.owner(c) for c in base.cell_numbers() if base.cover.cell_name(c) in move.out.dissolved}
+    if move.out.dissolved:
+        lost |= {base.cover.owner(c) for c in base.cell_numbers() if base.cover.cell_name(c) in move.out.dissolved}
     lost |= {cover.owner(c) for c in np.unique(bereaved).tolist()}
     if any(report.lost_elsewhere for report in reports):
         lost.add(EVERYWHERE)

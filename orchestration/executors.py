@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar
 
 from orchestration.local_cluster import Deserted, local_cluster
-from orchestration.memory import give_back, own_peak_memory_mb
+from orchestration.memory import give_back, own_peak_memory_mb, seldom_collected
 from orchestration.task_record import TaskRecord, added, recorded, taken_notes
 from submin.errors import ClusterError, InputError, KilledTaskError
 
@@ -310,7 +310,8 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         When no scheduler answers at the address.
     """
     if scheduler is None and workers <= 0:
-        yield ThreadExecutor(os.cpu_count() or 1)
+        with seldom_collected():
+            yield ThreadExecutor(os.cpu_count() or 1)
         return
     import dask
     from distributed import Client
@@ -322,7 +323,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
             client = Client(scheduler, timeout="10s")
         except (OSError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {scheduler!r} ({error}); start one with 'dask scheduler'") from None
-        with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), client:
+        with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), client, seldom_collected():
             yield DaskExecutor(client)
         return
     with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), local_cluster(workers) as (client, deserted):
