@@ -55,6 +55,19 @@ class SubMin:
     behind: Index | None = None
 
 
+@dataclass(frozen=True)
+class CombinedState:
+    """Corrections (m, p) of images (rows, ascending), and the covariance (n, n) of combinations of them, as the whole network has them.
+
+    ``whole``: nothing of the network has changed since it was reconciled.
+    """
+
+    images: Index
+    theta: Array
+    covariance: Array
+    whole: bool
+
+
 def wider(sub_min: SubMin, parameters: int) -> SubMin:
     """The sub-MIN with so many parameters an image: what is added is zero, and known to be."""
     images, old = sub_min.theta.shape
@@ -130,7 +143,7 @@ def factor(sums: Sums, rows: Index, images: ImageSet) -> SubMin:
     return SubMin(rows, estimate.theta[rank], covariance, estimate.chi_square, sums.redundancy)
 
 
-def locate(part: GroundPart, sub_min: SubMin) -> Array:
+def locate(part: GroundPart, sub_min: SubMin | CombinedState) -> Array:
     """Geocentric coordinates (n, 3) of the part's points."""
     theta = np.zeros((int(sub_min.images.max(initial=-1)) + 1, sub_min.theta.shape[1]))
     theta[sub_min.images] = sub_min.theta
@@ -177,18 +190,26 @@ def joint_covariance(loading: sp.csr_array, own: Array, covariance: Array) -> Ar
     ----------
     loading : U (3n, q); own : D (n, 3, 3); covariance : M (q, q), both triangles
     """
+    return with_own_parts(_seen_through(loading, covariance), own)
+
+
+def with_own_parts(joint: Array, own: Array) -> Array:
+    """`joint_covariance` where the lower triangle of ``U M U'`` (3n, 3n) is known; it is overwritten."""
+    diagonal = np.arange(len(own))
+    joint.reshape(len(own), 3, len(own), 3)[diagonal, :, diagonal, :] += own
+    return fill_symmetric(joint)
+
+
+def _seen_through(loading: sp.csr_array, covariance: Array) -> Array:
+    """``U M U'``, its lower triangle at least."""
     seen = np.unique(loading.indices)
     u, m = loading[:, seen], covariance[np.ix_(seen, seen)]
     if len(seen) <= DENSE_COLUMNS:
         dense = np.asfortranarray(u.toarray())
         half = la.blas.dsymm(1.0, np.asfortranarray(m), dense, side=1, lower=1)
         # U M U' = (U M/2) U' + U (M/2 U'): a rank-2k update writes one triangle in place
-        joint = la.blas.dsyr2k(0.5, half, dense, lower=0).T
-    else:
-        joint = np.ascontiguousarray(u @ np.ascontiguousarray((u @ m).T))
-    diagonal = np.arange(len(own))
-    joint.reshape(len(own), 3, len(own), 3)[diagonal, :, diagonal, :] += own
-    return fill_symmetric(joint)
+        return np.asarray(la.blas.dsyr2k(0.5, half, dense, lower=0).T)
+    return np.ascontiguousarray(u @ np.ascontiguousarray((u @ m).T))
 
 
 def covariances_of(part: GroundPart, sub_min: SubMin) -> Array:

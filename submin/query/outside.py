@@ -25,7 +25,7 @@ from submin.adjustment.estimation import cholesky
 from submin.adjustment.symmetric import between, fill_symmetric
 from submin.network.cell import kept_rows
 from submin.network.outside_messages import Elimination, carried
-from submin.network.sub_min import SubMin, add_sums
+from submin.network.sub_min import CombinedState, SubMin, add_sums
 from submin.network.whitened_vectors import Vectors, first_rows
 from submin.query.source import NetworkSource
 
@@ -201,24 +201,70 @@ def _as_reconciled(
     whole: bool,
 ) -> SubMin | None:  # fmt: skip
     """Images as the states of some tiles have them; one tile alone where it sees them all."""
-    sees = [np.isin(images, state.vectors.images) for state in states]
-    of_image = np.argmax(sees, axis=0) if len(images) else np.empty(0, dtype=np.int64)
-    if len(images) and not np.any(sees, axis=0).all():
+    chosen = _first_to_see(states, images)
+    if chosen is None:
         return None
-    alone = [k for k, seen in enumerate(sees) if seen.all()]
-    if alone:
-        of_image = np.full(len(images), alone[0])
     parts, order = [], []
-    for k in np.unique(of_image):
-        chosen = np.flatnonzero(of_image == k)
-        columns, prior = states[k].vectors.seen(images[chosen])
-        parts.append(Functionals(tiles[k], columns, _widened(prior, len(chosen), parameters)))
-        order.append(_rows_of(chosen, parameters))
+    for k, rows in chosen:
+        columns, prior = states[k].vectors.seen(images[rows])
+        parts.append(Functionals(tiles[k], columns, _widened(prior, len(rows), parameters)))
+        order.append(_rows_of(rows, parameters))
     mean, covariance = joint(kept, parts)
     place = np.argsort(np.concatenate([np.empty(0, dtype=np.int64), *order]))
     chi_square = sum(tree.chi_square for tree in trees.values())
     redundancy = sum(tree.redundancy for tree in trees.values())
     return SubMin(images, mean[place].reshape(-1, parameters), covariance[np.ix_(place, place)], chi_square, redundancy, whole=whole)
+
+
+def _first_to_see(states: Sequence[TileState], images: Index) -> list[tuple[int, NDArray[np.int64]]] | None:
+    """For some of the states the places of the images that are taken from each, of one alone where it sees them all.
+
+    None where an image is seen by none.
+    """
+    sees = [np.isin(images, state.vectors.images) for state in states]
+    if len(images) and not np.any(sees, axis=0).all():
+        return None
+    alone = [k for k, seen in enumerate(sees) if seen.all()]
+    of_image = np.full(len(images), alone[0]) if alone else np.argmax(sees, axis=0)
+    return [(int(k), np.flatnonzero(of_image == k)) for k in np.unique(of_image)]
+
+
+def combined_with_outside(
+    source: NetworkSource, kept: Reconciled, tiles: Sequence[int], images: Index, loading: sp.csr_array
+) -> CombinedState | None:
+    """What ``loading`` (n, m p) makes of the m ``images``, from some tiles and all that lies outside of them.
+
+    Few combinations of many images, as coordinates of points are, cost less to carry up the tree than all parameters of the images.
+    None where one tile sees all images or something has come since they were reconciled (see `tiles_with_outside`), or nobody can tell.
+    """
+    states = [state for state in (kept.tile(tile) for tile in tiles) if state is not None]
+    if not tiles or len(states) < len(tiles):
+        return None
+    trees = {name: kept.tree(name) for name in {state.tree for state in states}}
+    if any(_stale(tree, kept, tiles) for tree in trees.values()) or any(
+        _changed_owners(source, kept, tile, trees[state.tree].version) for tile, state in zip(tiles, states, strict=True)
+    ):
+        return None
+    chosen, p = _first_to_see(states, images), source.image_set(images[:1]).parameters
+    if chosen is None or len(chosen) < 2:
+        return None
+    parts, places, theta = [], [], np.zeros((len(images), p))
+    for k, rows in chosen:
+        columns, prior = states[k].vectors.seen(images[rows])
+        wide = _widened(prior, len(rows), p)
+        theta[rows] = np.asarray(wide @ states[k].mean[columns]).reshape(-1, p)
+        of_images = loading[:, _rows_of(rows, p)]
+        concerned = np.flatnonzero(np.diff(of_images.indptr))
+        parts.append(Functionals(tiles[k], columns, sp.csr_array(of_images[concerned] @ wide)))
+        places.append(concerned)
+    covariance = np.zeros((loading.shape[0], loading.shape[0]))
+    ends = np.cumsum([0, *map(len, places)])
+    _, of_parts = joint(kept, parts)
+    for a, rows in enumerate(places):
+        for b, columns in enumerate(places):
+            covariance[np.ix_(rows, columns)] += of_parts[ends[a] : ends[a + 1], ends[b] : ends[b + 1]]
+    whole = all(kept.changed.get(tile, 0) <= tree.version for tree in trees.values() for tile in tree.tiles)
+    return CombinedState(images, theta, covariance, whole)
 
 
 def _widened(prior: sp.csr_array, images: int, parameters: int) -> sp.csr_array:

@@ -16,7 +16,7 @@ from submin.adjustment.images import ImageSet
 from submin.errors import QueryError
 from submin.geodesy import geocentric_to_geodetic
 from submin.network.cell import Cell, factors
-from submin.network.sub_min import GroundPart, SubMin, joint_covariance, loadings, locate
+from submin.network.sub_min import CombinedState, GroundPart, SubMin, joint_covariance, loadings, locate, with_own_parts
 from submin.query import bounded_inflation, covariance_intersection, rigorous, split_intersection, tile
 from submin.query.source import Index, NetworkSource
 from submin.query.spread import check_most, spread_rows
@@ -191,19 +191,27 @@ def answer(source: NetworkSource, selections: Sequence[Selection], policy: str, 
         )  # fmt: skip
     policy, tiles = choose(source, kept, policy, tile_number)
     images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
-    state = POLICIES[policy](source, tiles, images, parts)
     ids = np.concatenate([s.cell.point_ids[s.rows] for s in kept])
     order = np.argsort(ids, kind="stable")
     axes = (3 * order[:, None] + np.arange(3)).ravel()  # sorted before the joint matrix is formed, which is never copied
-    loading = loadings(parts, state.images, state.theta.shape[1])[axes]
     own = np.concatenate([part.factors.own for part in parts])[order]
+    state: SubMin | CombinedState | None = None
+    if policy == "rigorous" and 3 * len(ids) < len(images) * parts[0].factors.loading.shape[2]:
+        loading = loadings(parts, images, parts[0].factors.loading.shape[2])[axes]
+        state = source.combined_with_outside(tiles, images, loading)
+    if state is None:
+        state = POLICIES[policy](source, tiles, images, parts)
+        covariance = joint_covariance(loadings(parts, state.images, state.theta.shape[1])[axes], own, state.covariance)
+        behind = state.images if state.behind is None else state.behind
+    else:
+        covariance, behind = with_own_parts(state.covariance, own), state.images
     return Answer(
         ids[order],
         np.concatenate([locate(part, state) for part in parts])[order],
-        joint_covariance(loading, own, state.covariance),
+        covariance,
         np.concatenate([np.full(len(s.rows), source.cover.owner(s.cell.number)) for s in kept])[order],
         np.concatenate([ray_counts(s.cell)[s.rows] for s in kept])[order],
-        policy, tuple(tiles), state.images if state.behind is None else state.behind,
+        policy, tuple(tiles), behind,
         state.whole or (policy in ("tile", "rigorous") and hold_all(source, tiles)),
     )  # fmt: skip
 

@@ -6,12 +6,13 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Protocol, TypeVar
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from submin.adjustment.elimination import Sums
 from submin.adjustment.images import ImageSet
 from submin.network.cell import Cell
-from submin.network.sub_min import SubMin
+from submin.network.sub_min import CombinedState, SubMin
 from submin.tiling.cover import Cover
 
 Index = NDArray[np.int32]
@@ -65,6 +66,13 @@ class NetworkSource(Protocol):
         It cannot before it is reconciled, nor once something is gone that was counted then (docs/mathematics.md, "Outside messages").
         """
         ...
+
+    def combined_with_outside(self, tiles: Sequence[int], images: Index, loading: sp.csr_array) -> CombinedState | None:
+        """State of some images (ascending), and the covariance of what ``loading`` (n, m p) makes of them, as in `with_outside`.
+
+        None where that costs no less than the covariance of the images.
+        """
+        return None
 
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         """Images of these rows (ascending)."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import scipy.sparse as sp
 import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
@@ -20,13 +21,13 @@ from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
 from submin.network.cell import Cell
 from submin.network.network_image import NetworkImage, image_set
-from submin.network.sub_min import SubMin, marginal
+from submin.network.sub_min import CombinedState, SubMin, marginal
 from submin.network.thinning import reported_points
 from submin.query.asked import Asked, few
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import PointsOfTile, cross_covariance, points_of_one_tile
 from submin.query.kept import Kept
-from submin.query.outside import UnionState, tiles_with_outside
+from submin.query.outside import UnionState, combined_with_outside, tiles_with_outside
 from submin.query.planner import (
     Answer,
     Selection,
@@ -457,6 +458,10 @@ class Network(NetworkSource):
     def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
         """State of some images from tiles and all that lies outside of them; None where the network cannot tell."""
         return tiles_with_outside(self, self._reconciled, tiles, images, self._unions) if self._reconciled else None
+
+    def combined_with_outside(self, tiles: Sequence[int], images: Index, loading: sp.csr_array) -> CombinedState | None:
+        """State of some images and the covariance of combinations of them; see `submin.query.outside.combined_with_outside`."""
+        return combined_with_outside(self, self._reconciled, tiles, images, loading) if self._reconciled else None
 
     def _earlier(self, version: int) -> Network:
         """The network as it was at a version, with as many parameters an image as now."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -295,6 +296,41 @@ def test_points_of_several_tiles_stay_exact_as_blocks_come(fuse: Callable[..., P
     _, found_at, found = points(growing.network, pair, state)
     np.testing.assert_allclose(found, covariance, atol=1e-8 * np.abs(covariance).max(), rtol=0.0)
     assert np.abs(found_at - at).max() < 1e-6
+
+
+def test_few_points_of_many_tiles_are_carried_up_the_tree_by_themselves(
+    fuse: Callable[..., Path], few: list[Block], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fewer coordinates than image parameters: the same answer as over all of these, and as the monolithic network's."""
+    place = fuse(few, tile_km=60.0, overlap_km=10.0)
+    reconcile(str(place), HERE)
+    network = submin.open(place)
+    every, _, _ = points(network, network.snapshot.tile_numbers(), whole := truth(network))
+    some = np.sort(np.random.default_rng(3).choice(every, 12, replace=False))
+    ways: list[bool] = []
+    direct = Network.combined_with_outside
+
+    def noted(*arguments: Any) -> Any:
+        found = direct(*arguments)
+        ways.append(found is not None)
+        return found
+
+    monkeypatch.setattr(Network, "combined_with_outside", noted)
+    found = network.query(points=some, policy="rigorous")
+    assert ways == [True]
+    assert len(found.tiles) > 3
+    assert found.scope == "network"
+    monkeypatch.setattr(Network, "combined_with_outside", lambda *_: None)
+    over_images = submin.open(place).query(points=some, policy="rigorous")
+    assert found.ids.tolist() == over_images.ids.tolist() == some.tolist()
+    np.testing.assert_allclose(found.covariance, over_images.covariance, rtol=0.0, atol=1e-11 * np.abs(found.covariance).max())
+    assert np.array_equal(found.covariance, found.covariance.T)
+    np.testing.assert_allclose(found.geocentric, over_images.geocentric, rtol=0.0, atol=1e-8)
+    ids, at, covariance = points(network, network.snapshot.tile_numbers(), whole)
+    rows = np.flatnonzero(np.isin(ids, some))
+    axes = (3 * rows[:, None] + np.arange(3)).ravel()
+    np.testing.assert_allclose(found.covariance, covariance[np.ix_(axes, axes)], rtol=0.0, atol=1e-8 * np.abs(covariance).max())
+    assert np.abs(found.geocentric - at[rows]).max() < 1e-6
 
 
 def test_islands_are_reconciled_by_themselves(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
