@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, TypeVar
@@ -182,6 +182,9 @@ class _OnDemand(Sequence[T]):
 
     def __len__(self) -> int:
         return self._count
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self._make, range(self._count))  # an IndexError of what makes them must not look like their end
 
     def __getitem__(self, k: Any) -> Any:
         if not 0 <= k < self._count:

@@ -174,7 +174,7 @@ def _registered(rays: LooseRays, images: ImageSet, rows: Index, cover: Cover, ex
         return register(rays, images, rows, cover)
     known = executor.share((images, rows, replace(cover)))  # without what the cover has worked out: it travels
     handles = executor.submit_all(locate_part, [(rays.take(part), known) for part in parts], "register", lambda: None)
-    return arranged(rays, joined(executor.results(handles)))
+    return arranged(rays, joined(executor.results(handles), parts))
 
 
 def _touched_tiles(cover: Cover, out: TakenOut, registration: Registration) -> list[int]:

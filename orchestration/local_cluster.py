@@ -18,13 +18,16 @@ GIVEN_UP = 120.0
 """Seconds without a single worker after which none is waited for: a killed one comes again in a few, on a busy machine in tens of them."""
 LOOKED_EVERY = 1.0
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-# glibc: freed memory is used again as it is, not given to the system and zeroed anew (a tenth of all work); see `memory.give_back`
-MEMORY = {"MALLOC_ARENA_MAX": "1", "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(1 << 30)}
+MEMORY = {"MALLOC_ARENA_MAX": "1", "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
+"""Of glibc: freed memory is used again as it is, not given to the system and cleared anew for each array (`memory.give_back` does that)"""
 SETTINGS = {
     "distributed.nanny.pre-spawn-environ": {**THREADS, **MEMORY},  # set before the workers load numpy
     # Dask would look at every stack a hundred times a second; what tasks took is in the run's record
     "distributed.worker.profile.enabled": False,
     "distributed.worker.memory.terminate": False,
+    # a worker that holds on to freed memory would stop taking tasks, and if all do the run would wait for ever
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.spill": False,
     # a killed worker may take long to come again where machines are busy; given up after this, it never would, and be waited for
     "distributed.deploy.lost-worker-timeout": "1 day",
 }

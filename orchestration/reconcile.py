@@ -134,6 +134,7 @@ def reconcile_changes(place: str, executor: Executor, reporter: Reporter | None 
     tiles = latest.tile_numbers()
     if len(tiles) < 2 or ReconciledStore.of(latest).current(tiles):
         return None
+    executor.give_back()  # what the change has left
     done = reconcile(place, executor, reporter)
     return done if done.version != latest.version else None
 

@@ -13,10 +13,10 @@ from submin.query.warm_up import compile_kernels
 
 
 class Prepared(WorkerPlugin):
-    """Workers, also those that come again, load what tasks need before the first one comes, and then look for garbage seldom."""
+    """Workers, also those that come again, begin to load what tasks need as soon as they start, and then look for garbage seldom."""
 
     def setup(self, worker: Any) -> None:
-        """Called by Dask in each worker; a thread does it, so that nobody waits: the coordinator reads the catalogue meanwhile."""
+        """Called by Dask in each worker. A thread loads the kernels while the coordinator reads the catalogue; a task may come before."""
         threading.Thread(target=_prepare, name="prepare", daemon=True).start()
 
 

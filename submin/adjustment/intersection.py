@@ -93,7 +93,7 @@ def intersect(images: ImageSet, rays: Rays, points: int) -> Array:
         step[~(np.isfinite(step).all(axis=1) & moving)] = 0.0  # each point stops by itself: its company must not matter
         ground = ground + step
         length = np.abs(step).max(axis=1)
-        # steps shrink at least as the last one has: where the next one is known to be short it need not be made
+        # steps are expected to shrink as the last one has: where the next one would be short it is not made
         shrinks = np.where(length < before, length / np.maximum(before, SETTLED_METRES), 1.0)
         moving &= length * shrinks >= SETTLED_METRES
         before = length

@@ -123,7 +123,7 @@ def _transposed_times(first: NDArray[np.int32], column: NDArray[np.int32], value
 def transposed_times(factor: sp.csr_array, vector: Array) -> Array:
     """``C' x`` (q,) of a factor C (n, q) with few entries and a vector (n,), without a transposed factor."""
     out = np.zeros(factor.shape[1])
-    _transposed_times(factor.indptr, factor.indices, factor.data, vector, out)
+    _transposed_times(factor.indptr.astype(np.int32), factor.indices.astype(np.int32), factor.data, vector, out)
     return out
 
 

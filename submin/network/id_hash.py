@@ -39,7 +39,7 @@ def look_up(entries: NDArray[np.uint64], values: NDArray[np.int64], wanted: NDAr
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look_up(
     entries: NDArray[np.uint64], values: NDArray[np.int64], wanted: NDArray[np.uint64], places: int, found: NDArray[np.int64]
 ) -> None:

@@ -112,13 +112,15 @@ class Registration:
     ----------
     arrivals : points by cell, with all of their rays
     directory : ids and cells of all points
-    apart : (n,) metres between the places to which the accepted rays of each point point; infinite where a camera reaches no ground
+    apart : (n,) metres between the places to which the rays of each point point that count; infinite where a camera reaches no ground
+    counts : (r,) True for rays that were accepted when last judged, or whose camera reaches no ground
     outside : (r,) True for rays on points outside the cover's rectangle
     """
 
     arrivals: dict[int, RegisteredPoints]
     directory: tuple[Ids, NDArray[np.int64]]
     apart: Array
+    counts: Flags
     outside: Flags
 
 
@@ -129,13 +131,14 @@ class Located:
     Attributes
     ----------
     origin : (n, 3) geocentric metres, NaN where a camera reaches no ground; cell : (n,) number, -1 there
-    outside : (n,) True for points outside the cover's rectangle; apart : (n,), see `Registration`
+    outside : (n,) True for points outside the cover's rectangle; apart : (n,), counts : (r,), see `Registration`
     """
 
     origin: Array
     cell: NDArray[np.int64]
     outside: Flags
     apart: Array
+    counts: Flags
 
 
 def register(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cover: Cover) -> Registration:
@@ -151,7 +154,7 @@ def locate(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cov
     point, points = rays.point, len(rays.ids)
     at, outside = np.full(points, -1, dtype=np.int64), np.zeros(points, dtype=np.bool_)
     if not len(rays):
-        return Located(np.empty((0, 3)), at, outside, np.empty(0))
+        return Located(np.empty((0, 3)), at, outside, np.empty(0), np.empty(0, dtype=np.bool_))
     named = np.argsort(np.array(images.ids, dtype=np.str_))
     rank = np.empty(len(named), dtype=np.int32)
     rank[named] = np.arange(len(named))
@@ -168,9 +171,9 @@ def locate(rays: LooseRays, images: ImageSet, image_rows: NDArray[np.int32], cov
     passing = np.full((len(point), 3), np.inf)
     if usable.any():
         passing[usable] = _passing(images, local[usable], rays.observed[usable], compact[point[usable]], origin[reached])
-    # only rays count that were accepted when last judged: a blunder that stage 1 has found is no second place
+    # a blunder that stage 1 has found is no second place
     counts = rays.accepted | ~np.isfinite(passing).all(axis=1)
-    return Located(origin, at, outside, _apart(point[counts], passing[counts], points))
+    return Located(origin, at, outside, _apart(point[counts], passing[counts], points), counts)
 
 
 def arranged(rays: LooseRays, located: Located) -> Registration:
@@ -188,7 +191,7 @@ def arranged(rays: LooseRays, located: Located) -> Registration:
             arrivals[number] = RegisteredPoints(
                 ids[members], located.origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
             )
-    return Registration(arrivals, (ids, at), located.apart, located.outside[point])
+    return Registration(arrivals, (ids, at), located.apart, located.counts, located.outside[point])
 
 
 def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
@@ -197,9 +200,15 @@ def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
     return np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part, minlength=parts))[:-1])
 
 
-def joined(parts: Sequence[Located]) -> Located:
-    """Where all points are registered, from what was found for parts of their rays as `by_points` makes them."""
-    return Located(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Located)))
+def joined(parts: Sequence[Located], rows: Sequence[NDArray[np.int64]]) -> Located:
+    """Where all points are registered, from parts of their rays, whose rows are those of `by_points`."""
+    counts = np.empty(sum(map(len, rows)), dtype=np.bool_)
+    for part, of_part in zip(parts, rows, strict=True):
+        counts[of_part] = part.counts
+    origin, cell, outside, apart = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("origin", "cell", "outside", "apart")
+    )
+    return Located(origin, cell, outside, apart, counts)
 
 
 def _passing(images: ImageSet, image: NDArray[np.int32], observed: Array, point: NDArray[np.int64], origin: Array) -> Array:
@@ -217,11 +226,10 @@ def contradictions(
 ) -> dict[int, tuple[str, float]]:
     """Blocks of a batch that measure a point elsewhere than the network or the blocks before them, with the point and how far off, metres.
 
-    Blocks are taken in their order, and one that contradicts is left out for those after it: the same as one at a time. Only rays count
-    that were accepted when last judged, or reach no ground. Arguments as of `register`, and its result.
+    Blocks are taken in their order, and one that contradicts is left out for those after it: the same as one at a time. Only rays that
+    count do (see `Registration`). Arguments as of `register`, and its result.
     """
-    apart = registration.apart
-    doubtful = rays.take((rays.accepted | ~np.isfinite(apart)[rays.point]) & (apart > SAME_POINT_METRES)[rays.point])
+    doubtful = rays.take(registration.counts & (registration.apart > SAME_POINT_METRES)[rays.point])
     most = _most_apart(doubtful, images, image_rows)
     kept = doubtful.block == IN_THE_NETWORK
     found: dict[int, tuple[str, float]] = {}
@@ -229,7 +237,8 @@ def contradictions(
         mine = doubtful.block == block
         now = (kept | mine) & np.isin(doubtful.point, doubtful.point[mine])
         together_now, points = doubtful.take(now), np.unique(doubtful.point[now])
-        apart = register(together_now, images, image_rows, cover).apart
+        all_count = replace(together_now, accepted=np.ones(len(together_now), dtype=np.bool_))
+        apart = register(all_count, images, image_rows, cover).apart
         too_far = apart - most[points]
         worst = int(np.argmax(too_far))
         if too_far[worst] > 0.0:

@@ -30,7 +30,7 @@ Ids = NDArray[np.str_]
 Rows = NDArray[np.int64]
 
 LEAST_WEIGHT = 1e-6
-ROUND_OFF = 1e-9
+ROUND_OFF = 1e-7
 """Part of a trace that tells nothing: near the least weight six digits cancel, and of two equal sets every weight is as good."""
 
 

@@ -102,7 +102,10 @@ class Sensor(Protocol):
     """The adjustable parameters of an image."""
 
     def pack(self, camera: Mapping[str, Any], width: float, height: float) -> Array:
-        """Row of numbers that describes one camera, from its catalogue description; raises `InputError` when it is incomplete."""
+        """Row of numbers that describes one camera, from its catalogue description; raises `InputError` when it is incomplete.
+
+        The description is not to be changed: others read the same object.
+        """
         ...
 
     def project(self, cameras: Array, parameters: Array, ground: Ground, image: Index, point: Index, at: Array | None = None) -> Projection:

@@ -204,7 +204,7 @@ def member_names(group: zarr.Group) -> list[str]:
 
 
 async def _side_by_side(reads: Iterable[Awaitable[T]]) -> list[T]:
-    """What some reads give. An error is raised once all are done: the event loop would print those that nobody waits for."""
+    """What some reads, or writes, give. An error is raised once all are done: the event loop would print those that nobody waits for."""
     done = await asyncio.gather(*reads, return_exceptions=True)
     found: list[T] = []
     for value in done:

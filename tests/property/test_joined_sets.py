@@ -117,6 +117,17 @@ def test_a_set_joined_with_itself_is_itself(seed: int) -> None:
     np.testing.assert_allclose(found.geocentric, one.geocentric[order], rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.parametrize(("count", "own"), [(30, 0.1), (300, 0.001)])
+def test_of_two_equal_sets_neither_is_left_out(count: int, own: float) -> None:
+    """Every weight is as good but for round-off, which near 0 and 1 costs six digits."""
+    rng = np.random.default_rng(count)
+    sources = rng.normal(size=(3 * count, 8))
+    one = PointSet(
+        np.array([f"P{k:03d}" for k in range(count)]), rng.normal(0.0, 1e5, (count, 3)), sources @ sources.T + own**2 * np.eye(3 * count)
+    )
+    assert 0.01 < join(one, one).weight < 0.99
+
+
 def test_a_set_that_knows_less_of_every_point_is_given_no_weight() -> None:
     one, _, _ = pair(4, *OVERLAPS["all"])
     worse = PointSet(one.ids, one.geocentric + 1.0, 4.0 * one.covariance)

@@ -36,6 +36,8 @@ from submin.network.registration import (
     together,
 )
 from submin.sensors import sensor_named
+from submin.sensors.base import Ground, Projection
+from submin.sensors.rpc import RpcSensor
 from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
@@ -524,8 +526,8 @@ def test_parts_put_together_are_the_whole(seed: int, parts: int) -> None:
     whole = register(rays, IMAGES, ROWS, COVER)
     rows = by_points(rays, parts)
     assert sorted(np.concatenate(rows).tolist()) == list(range(len(rays)))
-    found = arranged(rays, joined([locate(rays.take(part), IMAGES, ROWS, COVER) for part in rows]))
-    for name in ("apart", "outside"):
+    found = arranged(rays, joined([locate(rays.take(part), IMAGES, ROWS, COVER) for part in rows], rows))
+    for name in ("apart", "counts", "outside"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
     for k in range(2):
         np.testing.assert_array_equal(found.directory[k], whole.directory[k])
@@ -628,6 +630,25 @@ def test_a_blunder_that_stage_one_has_found_is_no_second_place() -> None:
         [arriving(["p"], THERE, [0, 1]), replace(arriving(["p"], places([3000.0], [0.0]), [2], block=1), accepted=np.array([False]))]
     )
     assert not contradicting(rays)
+
+
+@pytest.mark.parametrize("km", [1.0, 3.0, 5.5, 6.0, 7.0, 8.0])
+def test_nor_where_it_draws_the_point_out_of_sight_of_a_camera(km: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a line scanner does, a camera answers only for its image and a little beside it; registration still takes all rays."""
+    project, images = RpcSensor.project, replace(IMAGES, cameras=IMAGES.cameras.copy())
+    images.cameras[2, -2:] *= 10.0  # half of its size: the camera of the blunder sees far
+
+    def near_the_image(sensor: RpcSensor, cameras: Array, parameters: Array, ground: Ground, image: Index, *more: Any) -> Projection:
+        seen = project(sensor, cameras, parameters, ground, image, *more)
+        off = np.abs(seen.image - 5000.0).max(axis=1) > 1.06 * cameras[image, -1]
+        return replace(seen, image=np.where(off[:, None], np.nan, seen.image))
+
+    good, blunder = arriving(["p"], places([2000.0], [0.0]), [0, 1]), arriving(["p"], places([2000.0 + 1000.0 * km], [0.0]), [2], block=1)
+    rays = together([good, replace(blunder, accepted=np.array([False]))])
+    monkeypatch.setattr(RpcSensor, "project", near_the_image)
+    registration = register(rays, images, ROWS, COVER)
+    assert np.isinf(registration.apart[0]) == (km > 2.0)
+    assert not contradictions(rays, registration, images, ROWS, COVER)
 
 
 def test_apart_is_told_of_the_point_and_of_no_other() -> None:
