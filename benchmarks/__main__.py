@@ -53,7 +53,7 @@ BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "worldview": ("Tables 3 to 6 of the 2010 paper; pair = cell = simultaneous; time a pair", worldview.measure),
 }
 
-WITH_OUT = ("five-blocks", "worldview", "correlation", "continuity", "peers", "china", "scaling")
+WITH_OUT = ("five-blocks", "worldview", "correlation", "continuity", "peers", "china", "scaling", "query")
 
 GOOD = (MET, DATA, faults.IDENTICAL, "")
 """Verdicts that ask for nothing; the paper's own lines have none."""
@@ -71,7 +71,9 @@ def command(
     network: Annotated[Path | None, typer.Option(help="query: a network that is there already, in place of a new one.")] = None,
     figures: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for figures: five-blocks, worldview, correlation, continuity; for rows: peers, china, scaling."),
+        typer.Option(
+            "--out", help="Folder for figures: five-blocks, worldview, correlation, continuity; for rows: peers, china, scaling, query"
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 import submin
 from benchmarks.comparison import verdict
+from benchmarks.record import write_record
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import executor_for
 from orchestration.reconcile import reconcile
@@ -62,11 +63,19 @@ class Case:
     cold_ms: float | None
 
 
-def measure(scale: float, workers: int, network: Path | None = None) -> list[dict[str, Any]]:
+def measure(scale: float, workers: int, network: Path | None = None, out: Path | None = None) -> list[dict[str, Any]]:
     """Rows of the network and of the questions; ``network``: one that is there already, in place of a new one.
 
-    It is asked as it is, and once more after it has been reconciled, which is done here where it was not.
+    It is asked as it is, and once more after it has been reconciled, which is done here where it was not. ``out``: folder for
+    ``query.json``.
     """
+    rows = _rows(scale, workers, network)
+    if out is not None:
+        write_record(out, "query", scale, workers, rows)
+    return rows
+
+
+def _rows(scale: float, workers: int, network: Path | None) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         place, seconds = (str(network), float("nan")) if network is not None else _made(Path(folder), scale, workers)
         opened = submin.open(place)

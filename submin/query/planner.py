@@ -254,7 +254,11 @@ def hold_all(source: NetworkSource, tiles: Sequence[int]) -> bool:
 def determined_parts(source: NetworkSource, selections: Sequence[Selection]) -> tuple[list[Selection], list[GroundPart]]:
     """Those of some points that are determined, and their ground parts; cells without any are left out."""
     rows = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(s.cell.images for s in selections)]))
-    images = source.image_set(rows)
+    return ground_parts(selections, rows, source.image_set(rows))
+
+
+def ground_parts(selections: Sequence[Selection], rows: Index, images: ImageSet) -> tuple[list[Selection], list[GroundPart]]:
+    """As `determined_parts`; ``images`` are those of the selections' cells, ``rows`` (ascending) theirs in the network."""
     both = [ground_part(s, images.take(np.searchsorted(rows, s.cell.images))) for s in selections]
     return [kept for kept, _ in both if len(kept.rows)], [part for kept, part in both if len(kept.rows)]
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections import deque
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from datetime import date
 from typing import TYPE_CHECKING
@@ -11,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from submin import accuracy
+from submin.adjustment.images import ImageSet
 from submin.geodesy import geocentric_to_geodetic, local_axes, rotate_covariance
-from submin.network.sub_min import covariances_of, locate
-from submin.query.planner import Rows, Selection, determined_parts, points_of_tile, ray_counts
+from submin.network.sub_min import SubMin, covariances_of, locate
+from submin.query.planner import Rows, Selection, ground_parts, points_of_tile, ray_counts
 from submin.query.tile import tile_state
 from submin.storage.dense_reader import DenseReader
 
@@ -21,6 +25,10 @@ if TYPE_CHECKING:
     from submin.storage.network import Network
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int32]
+
+THREADS = min(os.cpu_count() or 1, 8)
+"""Tiles that are worked on side by side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +67,12 @@ class PointAccuracy:
 def accuracy_of_all(network: Network, day: date) -> PointAccuracy:
     """Every determined point, thinned and retired ones too, as policy ``tile`` has it from the tile whose core holds the point.
 
-    Points whose rays determine no position are left out. Memory is that of one tile's sub-MIN and of its own points.
+    Points whose rays determine no position are left out. Memory is that of a few tiles' sub-MINs and of their own points.
     """
     if network.dense is not None:
         return accuracy_of_dense(network.dense)
     owned = (points_of_tile(network, tile, core=True) for tile in network.snapshot.tile_numbers())
-    return _joined(_of_tile(network, network.cover.owner(found[0].cell.number), found, day) for found in owned if found)
+    return _of_tiles(network, ((network.cover.owner(found[0].cell.number), found) for found in owned if found), day)
 
 
 def accuracy_of(network: Network, selections: Sequence[Selection], day: date, tile: int | None = None) -> PointAccuracy:
@@ -72,7 +80,7 @@ def accuracy_of(network: Network, selections: Sequence[Selection], day: date, ti
     by_tile: dict[int, list[Selection]] = {}
     for selection in selections:
         by_tile.setdefault(network.cover.owner(selection.cell.number) if tile is None else tile, []).append(selection)
-    return _joined(_of_tile(network, number, by_tile[number], day) for number in sorted(by_tile))
+    return _of_tiles(network, sorted(by_tile.items()), day)
 
 
 def accuracy_of_dense(dense: DenseReader, rows: Rows | None = None) -> PointAccuracy:
@@ -85,26 +93,79 @@ def accuracy_of_dense(dense: DenseReader, rows: Rows | None = None) -> PointAccu
     return found if rows is None else found.take(rows)
 
 
-def _of_tile(network: Network, tile: int, selections: Sequence[Selection], day: date) -> PointAccuracy:
-    """Accuracy of some points from one tile that holds them."""
-    kept, parts = determined_parts(network, selections)
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """Points of one tile, and all that their accuracy follows from.
+
+    Attributes
+    ----------
+    tile : its name; selections : the points
+    rows : (m,) of the images of their cells in the network; images : these
+    state : of the images that see the points
+    retired : (n,) of each selection
+    """
+
+    tile: str
+    selections: Sequence[Selection]
+    rows: Index
+    images: ImageSet
+    state: SubMin
+    retired: Sequence[NDArray[np.bool_]]
+
+
+def _read(network: Network, tile: int, selections: Sequence[Selection], day: date) -> _Asked:
+    """What the network has of some points that a tile holds."""
+    rows = np.unique(np.concatenate([s.cell.images for s in selections])).astype(np.int32)
+    images = network.image_set(rows)
+    return _Asked(
+        network.cover.tile_name(tile), selections, rows, images, tile_state(network, tile, _seeing(selections)),
+        [~network.validity.valid(s.cell.point_ids, day) for s in selections],
+    )  # fmt: skip
+
+
+def _seeing(selections: Sequence[Selection]) -> Index:
+    """Rows of the images with a ray of any of the points."""
+    found = []
+    for s in selections:
+        chosen = np.zeros(len(s.cell), dtype=np.bool_)
+        chosen[s.rows] = True
+        seen = np.zeros(len(s.cell.images), dtype=np.bool_)
+        seen[s.cell.rays.image[chosen[s.cell.rays.point]]] = True
+        found.append(s.cell.images[seen])
+    return np.unique(np.concatenate(found)).astype(np.int32)
+
+
+def _computed(network: Network, asked: _Asked) -> PointAccuracy:
+    """Accuracy of the points that their rays determine. Nothing is read: several tiles are worked on side by side."""
+    kept, parts = ground_parts(asked.selections, asked.rows, asked.images)
     if not parts:
         return _joined([])
-    images = np.unique(np.concatenate([part.linear.image for part in parts])).astype(np.int32)
-    state = tile_state(network, tile, images)
-    geodetic = geocentric_to_geodetic(np.concatenate([locate(part, state) for part in parts]), network.cover.ellipsoid)
-    local = rotate_covariance(np.concatenate([covariances_of(part, state) for part in parts]), local_axes(geodetic))
+    geodetic = geocentric_to_geodetic(np.concatenate([locate(part, asked.state) for part in parts]), network.cover.ellipsoid)
+    local = rotate_covariance(np.concatenate([covariances_of(part, asked.state) for part in parts]), local_axes(geodetic))
+    retired = {s.cell.number: of_cell for s, of_cell in zip(asked.selections, asked.retired, strict=True)}
     return PointAccuracy(
         ids=np.concatenate([s.cell.point_ids[s.rows] for s in kept]),
         geodetic=geodetic,
         local_covariance=local,
         ce90=accuracy.ce90(local[:, :2, :2]),
         le90=accuracy.le90(local[:, 2, 2]),
-        tile=np.full(len(geodetic), network.cover.tile_name(tile)),
+        tile=np.full(len(geodetic), asked.tile),
         rays=np.concatenate([ray_counts(s.cell)[s.rows] for s in kept]),
         thinned=np.concatenate([~network.left_by_thinning(s.cell)[s.rows] for s in kept]),
-        retired=np.concatenate([~network.validity.valid(s.cell.point_ids[s.rows], day) for s in kept]),
+        retired=np.concatenate([retired[s.cell.number][s.rows] for s in kept]),
     )
+
+
+def _of_tiles(network: Network, by_tile: Iterable[tuple[int, Sequence[Selection]]], day: date) -> PointAccuracy:
+    """Accuracy of points by tile: one thread reads, and few tiles are in memory while others compute, whose kernels do not wait."""
+    with ThreadPoolExecutor(THREADS, thread_name_prefix="accuracy") as pool:
+        waiting: deque[Future[PointAccuracy]] = deque()
+        done = []
+        for tile, selections in by_tile:
+            waiting.append(pool.submit(_computed, network, _read(network, tile, selections, day)))
+            if len(waiting) > THREADS:
+                done.append(waiting.popleft().result())
+        return _joined([*done, *(one.result() for one in waiting)])
 
 
 def _joined(parts: Iterable[PointAccuracy]) -> PointAccuracy:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from datetime import date
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -95,7 +95,7 @@ class Network(NetworkSource):
         self._exists: dict[int, bool] = {}
         self._tiles: set[int] = set()
         self._dense = DenseReader(self._snapshot) if is_dense(self._snapshot) else None
-        self._reconciled = ReconciledStore(snapshot, self._earlier)
+        self._reconciled = ReconciledStore(snapshot, partial(_as_it_was, snapshot))  # not a method: it would keep the network in memory
         self._unions: dict[tuple[int, ...], UnionState] = {}
 
     @property
@@ -463,10 +463,6 @@ class Network(NetworkSource):
         """State of some images and the covariance of combinations of them; see `submin.query.outside.combined_with_outside`."""
         return combined_with_outside(self, self._reconciled, tiles, images, loading) if self._reconciled else None
 
-    def _earlier(self, version: int) -> Network:
-        """The network as it was at a version, with as many parameters an image as now."""
-        return self.at(f"v{version}", self._snapshot.metadata.parameters)
-
     def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
         """Images of these rows; the latest asked for are kept in memory."""
         if len(self._plain_images) > KEPT_IMAGES:
@@ -517,6 +513,11 @@ class Network(NetworkSource):
             scope="network" if found.network_wide else "tiles",
             validity=self.validity.intervals(found.ids),
         )
+
+
+def _as_it_was(snapshot: Snapshot, version: int) -> Network:
+    """The network of a version as it was at an earlier one, with as many parameters an image."""
+    return Network(snapshot.place, f"v{version}", snapshot.metadata.parameters)
 
 
 def open_network(path: str | Path, version: str | None = None) -> Network:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import submin
 from submin.network.cell import Cell
 from submin.query.control_set import ControlSet
 from submin.simulation.region import simulate_region
+from submin.storage import accuracy_map
 from submin.storage import network as module
 from submin.storage.network_store import Snapshot
 from submin.storage.simulated import write_region
@@ -136,3 +139,29 @@ def test_only_all_tiles_are_the_network(place: Path) -> None:
     assert network.query(bbox=EVERYWHERE, policy="rigorous").scope == "network"
     tiles = [network.query(tile=network.cover.tile_name(tile)) for tile in network.snapshot.tile_numbers()]
     assert {answer.scope for answer in tiles if len(answer)} == {"tiles"}
+
+
+@pytest.mark.parametrize("policy", ["tile", "ci", "rigorous"])
+def test_a_network_that_nobody_uses_any_more_is_gone_at_once(place: Path, policy: str) -> None:
+    """It keeps up to a gigabyte, which must not wait for a garbage collection that looks for cycles."""
+    network = submin.open(place)
+    network.query(bbox=inner_box(network), policy=policy)
+    network.accuracy(bbox=inner_box(network))
+    used = weakref.ref(network)
+    gc.disable()
+    try:
+        del network
+        assert used() is None
+    finally:
+        gc.enable()
+
+
+def test_accuracy_by_many_threads_is_that_by_one(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for threads in (1, 5):
+        monkeypatch.setattr(accuracy_map, "THREADS", threads)
+        found.append(submin.open(place).accuracy())
+    assert len(np.unique(found[0].tile)) == 16
+    np.testing.assert_array_equal(found[0].ids, found[1].ids)
+    np.testing.assert_array_equal(found[0].local_covariance, found[1].local_covariance)
+    np.testing.assert_array_equal(found[0].tile, found[1].tile)
