@@ -86,20 +86,20 @@ class BatchResult:
 
 def fuse_batch(
     where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter,
-    images: ImagesOf, innovation: float = REJECTED, check_points: NDArray[np.str_] | None = None,
+    images: ImagesOf, innovation: float = REJECTED, check_points: NDArray[np.str_] | None = None, known: Snapshot | None = None,
 ) -> BatchResult:  # fmt: skip
     """Fuse blocks that the ledger of a version has let through; ``rejected`` ones are entered in the ledger in the same commit.
 
     ``images`` are those of the blocks, by block, as the network will have them. In the same commit go the ids of ``check_points``, where
     blocks are fused. A block that contradicts that version as a whole is rejected when one of fewer than ``innovation`` good blocks would
-    (0: none is).
+    (0: none is). ``known`` is that version where it is open already.
 
     Raises
     ------
     ConflictError
         When another run has committed meanwhile; nothing of the batch is in the network then.
     """
-    session, base = begin_change(where, version)
+    session, base = begin_change(where, version, known)
     refused = list(rejected)
     accepted, tests = _stage_one(blocks, images, base, executor, reporter, refused)
     against = {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}

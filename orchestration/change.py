@@ -7,7 +7,7 @@ write to forks of its session (docs/architecture.md). A crash anywhere before th
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import icechunk
@@ -37,7 +37,7 @@ from submin.sensors import width_of
 from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
 from submin.storage.catalogue_schema import ImageRecord
 from submin.storage.ledger import Entry, append_entries
-from submin.storage.network_store import Snapshot, commit
+from submin.storage.network_store import Snapshot, commit, summed_cells
 from submin.storage.reconciled import EVERYWHERE, TILE_STATES, Changes, note_changes
 from submin.storage.schema import image_columns, write_joint
 from submin.tiling.cover import Cover
@@ -183,14 +183,9 @@ def _touched_tiles(cover: Cover, out: TakenOut, registration: Registration) -> l
 
 @dataclass(frozen=True)
 class Stored:
-    """What a version has, listed when first asked for, and once: its tiles, and its cells by name."""
+    """What a version has, listed when first asked for, and once: its cells by name."""
 
     base: Snapshot
-
-    @cached_property
-    def tiles(self) -> frozenset[int]:
-        """Tiles that have a sub-MIN."""
-        return frozenset(self.base.tile_numbers())
 
     @cached_property
     def cells(self) -> dict[str, int]:
@@ -206,7 +201,7 @@ def _overfull(stored: Stored, cover: Cover, parameters: int, tile: int, out: Tak
     limit = base.metadata.max_parameters // parameters
     arriving = {c: registration.arrivals[c].image for c in cover.cells_held(tile) if c in registration.arrivals}
     seen = [np.empty(0, dtype=np.int32), *arriving.values()]
-    if tile in stored.tiles:
+    if base.has_tile(tile):
         at_most = len(np.unique(np.concatenate([*seen, base.tile_images(tile)])))
         if at_most <= limit:
             return False
@@ -353,7 +348,10 @@ def finish(
     metadata = replace(base.metadata, cover=move.cover.to_mapping(), parameters=move.parameters)
     if metadata != base.metadata:
         root.attrs.update(metadata.to_attributes())
-    root.attrs["version"] = version
+    touched = [move.cover.cell_name(cell) for report in settled.reports for cell in report.changed]
+    touched += [name.removeprefix("cells/") for name in settled.gone if name.startswith("cells/")]
+    totals = base.ray_totals().changed(base.summed_cells(set(touched)), summed_cells(root, set(touched)))
+    root.attrs.update({"version": version, "rays": asdict(totals)})
     commit(session, version, message)
 
 

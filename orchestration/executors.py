@@ -10,8 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from orchestration.local_cluster import Deserted, local_cluster
-from orchestration.memory import give_back, own_peak_memory_mb, seldom_collected
+from orchestration.memory import give_back, keep_freed, own_peak_memory_mb, seldom_collected
 from orchestration.task_record import TaskRecord, added, recorded, taken_notes
 from submin.errors import ClusterError, InputError, KilledTaskError
 
@@ -310,7 +312,8 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         When no scheduler answers at the address.
     """
     if scheduler is None and workers <= 0:
-        with seldom_collected():
+        keep_freed()
+        with seldom_collected(), threadpool_limits(1, user_api="blas"):  # BLAS with threads of its own in each thread takes twice as long
             yield ThreadExecutor(os.cpu_count() or 1)
         return
     import dask

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from typing import Any
@@ -162,7 +163,9 @@ def run(
     tally = fuse_blocks(
         every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids
     )
-    return _result(Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
+    after = Snapshot.open(place)
+    # another run may have gone on meanwhile
+    return _result(after if after.number == tally.version else Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
 
 
 def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:
@@ -196,30 +199,32 @@ def fuse_blocks(
     ConflictError
         When one has written to it since the ledger was read, where there is no lock to keep it out.
     """
-    with writing(place):
-        before = Snapshot.open(place)
+    with writing(place), ThreadPoolExecutor(1, thread_name_prefix="directory") as beside:
+        known: Snapshot | None
+        before = known = Snapshot.open(place)
+        beside.submit(before.directory)  # while the ledger and the first blocks are read
         tally = Tally(before.number, {row for _, row in before.flags()})
         new = _new_blocks(blocks, Ledger.of(before), tally, reporter)
+        del before
         for number, batch in enumerate(batches_ahead(_with_images(new), max(batch_blocks, 1))):
             if number:
                 executor.give_back()
-            good = [known.block for known in batch if known.reason is None]
-            refused = [Rejected.of(known.block, known.reason) for known in batch if known.reason is not None]
-            images = {known.block.block_id: known.images for known in batch}
-            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points))
+            good = [come.block for come in batch if come.reason is None]
+            refused = [Rejected.of(come.block, come.reason) for come in batch if come.reason is not None]
+            images = {come.block.block_id: come.images for come in batch}
+            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points, known))
+            known = None  # with all that it has read
             reporter.fused(len(batch))
     return tally
 
 
 def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -> RunResult:
     released = {row for _, row in after.flags()} - tally.released
-    cells = after.cell_counts(after.cell_numbers())
-    used, in_pixels = (sum(cell[name] for cell in cells) for name in ("accepted", "pixel_rays"))
-    square = sum(cell["square_px"] for cell in cells)
+    totals = after.ray_totals()
     return RunResult(
         after.version, tally.fused, tally.skipped, tally.control, tally.observations,
         tuple(tally.rejected), tuple(tally.doubtful), tuple(tally.flagged[row] for row in sorted(released)), tally.contradicted,
-        float(np.sqrt(square / (2.0 * in_pixels))) if in_pixels else 0.0, used, sum(cell["rays"] for cell in cells) - used,
+        totals.rms_px, totals.accepted, totals.rays - totals.accepted,
         tuple(after.cover.tile_name(t) for t in sorted(tally.unsettled)), time.monotonic() - started, executor.peak_memory_mb(),
         executor.task_records(),
     )  # fmt: skip

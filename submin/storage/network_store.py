@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 from datetime import datetime
 from functools import cached_property, lru_cache
 from inspect import signature
@@ -206,6 +206,32 @@ def tag_version(place: str, tag: str, name: str | None = None) -> Version:
     return replace(version, tags=(*version.tags, tag))
 
 
+@dataclass(frozen=True)
+class RayTotals:
+    """Rays of cells, the accepted ones, those of these that are measured in pixels, and the sum of their squared residuals, px2."""
+
+    rays: int
+    accepted: int
+    pixel_rays: int
+    square_px: float
+
+    def changed(self, before: RayTotals, after: RayTotals) -> RayTotals:
+        """Totals in which what some cells summed to is exchanged for what they sum to now."""
+        return RayTotals(*(t - b + a for t, b, a in zip(astuple(self), astuple(before), astuple(after), strict=True)))
+
+    @property
+    def rms_px(self) -> float:
+        """Residual of the accepted rays that are measured in pixels, RMS of one coordinate; 0 without any."""
+        return float(np.sqrt(max(self.square_px, 0.0) / (2.0 * self.pixel_rays))) if self.pixel_rays else 0.0
+
+
+def summed_cells(root: zarr.Group, names: Iterable[str] | None = None) -> RayTotals:
+    """See `Snapshot.summed_cells`; ``root`` may be of a version that is being written."""
+    group = group_of(root, "cells")
+    cells = [cell for cell in read_attributes(group, member_names(group) if names is None else names) if cell is not None]
+    return RayTotals(*(sum(cell[field.name] for cell in cells) for field in fields(RayTotals)))
+
+
 @lru_cache(maxsize=4)
 def _cover(text: str) -> Cover:
     """The cover of a description: versions share it, and with it what it has worked out of its cells."""
@@ -247,6 +273,13 @@ class Snapshot:
     def version(self) -> str:
         """``v12``."""
         return f"v{self.number}"
+
+    @property
+    def commit(self) -> str:
+        """The snapshot of the repository that holds the version."""
+        store = self.root.store
+        assert isinstance(store, icechunk.IcechunkStore)
+        return str(store.session.snapshot_id)
 
     def cell(self, number: int, *, with_sums: bool = True) -> Cell:
         """A cell, empty when it has no points yet."""
@@ -293,6 +326,15 @@ class Snapshot:
         """Counts of some cells that are there, without reading their arrays."""
         found = read_attributes(group_of(self.root, "cells"), map(self.cover.cell_name, numbers))
         return [attributes for attributes in found if attributes is not None]
+
+    def ray_totals(self) -> RayTotals:
+        """What the rays of all cells sum to."""
+        stated = attributes_of(self.root).get("rays")
+        return self.summed_cells() if stated is None else RayTotals(**stated)
+
+    def summed_cells(self, names: Iterable[str] | None = None) -> RayTotals:
+        """What the rays of some cells (names) that are there sum to, or of all."""
+        return summed_cells(self.root, names)
 
     def tile_numbers(self) -> tuple[int, ...]:
         """Tiles that have a sub-MIN, ascending."""
@@ -350,10 +392,14 @@ class Snapshot:
         """Columns of the ledger of blocks; a block's last row counts."""
         return read_table(group_of(self.root, "ledger"), wanted)
 
-    def flags(self) -> set[tuple[int, int]]:
+    def flags(self) -> frozenset[tuple[int, int]]:
         """Pairs of tile and image row: the tile finds the image's camera bad."""
+        return self._flags
+
+    @cached_property
+    def _flags(self) -> frozenset[tuple[int, int]]:
         table = read_table(group_of(self.root, "flags"))
-        return set(zip(table["tile"].tolist(), table["image"].tolist(), strict=True))
+        return frozenset(zip(table["tile"].tolist(), table["image"].tolist(), strict=True))
 
     def candidate_cells(self, point_ids: NDArray[np.str_]) -> NDArray[np.int64]:
         """Cell (n,) in which each point would be, by the directory; -1 for points that are not in the network."""
@@ -390,8 +436,10 @@ def _root(session: icechunk.Session) -> zarr.Group:
     return zarr.open_group(session.store, mode="r", zarr_format=3, use_consolidated=False)
 
 
-def begin_change(place: str, version: int) -> tuple[icechunk.Session, Snapshot]:
+def begin_change(place: str, version: int, known: Snapshot | None = None) -> tuple[icechunk.Session, Snapshot]:
     """A session in which to write what follows a version, and that version, which what is written does not change.
+
+    ``known`` is that version where it is open already: what it has read is not read again.
 
     Raises
     ------
@@ -402,6 +450,8 @@ def begin_change(place: str, version: int) -> tuple[icechunk.Session, Snapshot]:
     """
     repository = _open_repository(place)
     session = repository.writable_session(BRANCH)
+    if known is not None and known.number == version and known.commit == session.snapshot_id:
+        return session, known
     base = repository.readonly_session(snapshot_id=session.snapshot_id)
     try:
         snapshot = Snapshot(_root(base), place)

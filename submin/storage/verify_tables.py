@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,7 @@ def verify_network(snapshot: Snapshot, cells: Sequence[CellContents], complete: 
     problems: list[Problem] = []
     checks: tuple[tuple[str, Callable[[], list[Problem]]], ...] = (
         ("the history", lambda: verify_history(snapshot)),
+        ("the totals of rays", lambda: _ray_totals(snapshot)),
         ("the image table", lambda: _image_table(snapshot)),
         ("the ledger", lambda: _ledger(snapshot, cells, complete)),
         ("the flags of bad cameras", lambda: _flags(snapshot)),
@@ -62,6 +63,15 @@ def verify_history(snapshot: Snapshot) -> list[Problem]:
     """The number of a version is written in its root and in its commit."""
     count = [version.number for version in versions(snapshot.place)].count(snapshot.number)
     return [] if count == 1 else [Problem("", "metadata", f"the root says version {snapshot.number}; the history has {count} of them")]
+
+
+def _ray_totals(snapshot: Snapshot) -> list[Problem]:
+    """Totals follow every change of a cell; squares are added up in another order."""
+    stated, found = snapshot.ray_totals(), snapshot.summed_cells()
+    near = abs(stated.square_px - found.square_px) <= 1e-6 * max(found.square_px, 1.0)
+    if near and replace(stated, square_px=found.square_px) == found:
+        return []
+    return [Problem("", "metadata", f"the root has {stated} for all cells together; the cells sum to {found}")]
 
 
 def _image_table(snapshot: Snapshot) -> list[Problem]:

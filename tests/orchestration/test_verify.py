@@ -333,6 +333,28 @@ def test_a_version_that_the_history_does_not_have(base: Path) -> None:
     assert pairs(verify(str(base), HERE)) == {("metadata", "")}
 
 
+@pytest.mark.parametrize(("part", "by"), [("rays", 1), ("accepted", -1), ("pixel_rays", 2), ("square_px", 0.5)])
+def test_totals_that_are_not_those_of_the_cells(base: Path, part: str, by: float) -> None:
+    store = Store(base)
+    totals = dict(store.root.attrs.asdict()["rays"])
+    assert totals["rays"] > totals["accepted"] > 0
+    store.root.attrs["rays"] = totals | {part: totals[part] + by}
+    store.commit()
+    assert pairs(verify(str(base), HERE)) == {("metadata", "")}
+
+
+def test_a_network_without_totals_is_sound(base: Path) -> None:
+    """As it was written before they were kept."""
+    store = Store(base)
+    before = store.base.ray_totals()
+    del store.root.attrs["rays"]
+    store.commit()
+    assert verify(str(base), HERE).ok
+    found = Snapshot.open(str(base)).ray_totals()
+    assert (found.rays, found.accepted, found.pixel_rays) == (before.rays, before.accepted, before.pixel_rays)
+    assert found.square_px == pytest.approx(before.square_px, rel=1e-12)  # added up in another order
+
+
 def test_a_cover_that_cannot_be_understood(base: Path) -> None:
     store = Store(base)
     values = dict(store.root.attrs.asdict()["submin"])
