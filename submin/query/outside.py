@@ -147,16 +147,13 @@ def tiles_with_outside(
 
     ``memory`` keeps what tiles say together with what has come since they were reconciled.
     """
-    states = [state for state in (kept.tile(tile) for tile in tiles) if state is not None]
-    if not tiles or len(states) < len(tiles):
+    known = _known(kept, tiles)
+    if known is None:
         return None
-    trees = {name: kept.tree(name) for name in {state.tree for state in states}}
-    if any(_stale(tree, kept, tiles) for tree in trees.values()):
-        return None
+    states, trees = known
     p = source.image_set(images[:1]).parameters
-    if not any(_changed_owners(source, kept, tile, trees[state.tree].version) for tile, state in zip(tiles, states, strict=True)):
-        whole = all(kept.changed.get(tile, 0) <= tree.version for tree in trees.values() for tile in tree.tiles)
-        return _as_reconciled(kept, tiles, states, trees, images, p, whole)
+    if _unchanged(source, kept, tiles, states, trees):
+        return _as_reconciled(kept, tiles, states, trees, images, p)
     key = tuple(sorted(tiles))
     if key not in memory:
         union = _with_increments(source, kept, tiles, states, trees, p)
@@ -173,6 +170,30 @@ def tiles_with_outside(
     return SubMin(
         images, np.asarray(k @ state.mean).reshape(-1, p), between(k, state.covariance), state.chi_square, state.redundancy, whole=False
     )
+
+
+def _known(kept: Reconciled, tiles: Sequence[int]) -> tuple[list[TileState], dict[str, TreeState]] | None:
+    """The states of some tiles, and the parts of the network that they are of.
+
+    None where a tile has none, or where one counts something that is no more.
+    """
+    states = [state for state in (kept.tile(tile) for tile in tiles) if state is not None]
+    if not tiles or len(states) < len(tiles):
+        return None
+    trees = {name: kept.tree(name) for name in {state.tree for state in states}}
+    return None if any(_stale(tree, kept, tiles) for tree in trees.values()) else (states, trees)
+
+
+def _unchanged(
+    source: NetworkSource, kept: Reconciled, tiles: Sequence[int], states: Sequence[TileState], trees: Mapping[str, TreeState]
+) -> bool:
+    """True when nothing has come to the cells of some tiles since they were reconciled."""
+    return not any(_changed_owners(source, kept, tile, trees[state.tree].version) for tile, state in zip(tiles, states, strict=True))
+
+
+def _nothing_since(kept: Reconciled, trees: Mapping[str, TreeState]) -> bool:
+    """True when nothing has come to any tile of these parts of the network since they were reconciled."""
+    return all(kept.changed.get(tile, 0) <= tree.version for tree in trees.values() for tile in tree.tiles)
 
 
 def _rows_of(images: NDArray[np.integer], parameters: int) -> NDArray[np.int64]:
@@ -198,7 +219,6 @@ def _changed_owners(source: NetworkSource, kept: Reconciled, tile: int, version:
 
 def _as_reconciled(
     kept: Reconciled, tiles: Sequence[int], states: Sequence[TileState], trees: Mapping[str, TreeState], images: Index, parameters: int,
-    whole: bool,
 ) -> SubMin | None:  # fmt: skip
     """Images as the states of some tiles have them; one tile alone where it sees them all."""
     chosen = _first_to_see(states, images)
@@ -213,7 +233,10 @@ def _as_reconciled(
     place = np.argsort(np.concatenate([np.empty(0, dtype=np.int64), *order]))
     chi_square = sum(tree.chi_square for tree in trees.values())
     redundancy = sum(tree.redundancy for tree in trees.values())
-    return SubMin(images, mean[place].reshape(-1, parameters), covariance[np.ix_(place, place)], chi_square, redundancy, whole=whole)
+    return SubMin(
+        images, mean[place].reshape(-1, parameters), covariance[np.ix_(place, place)], chi_square, redundancy,
+        whole=_nothing_since(kept, trees),
+    )  # fmt: skip
 
 
 def _first_to_see(states: Sequence[TileState], images: Index) -> list[tuple[int, NDArray[np.int64]]] | None:
@@ -237,14 +260,10 @@ def combined_with_outside(
     Few combinations of many images, as coordinates of points are, cost less to carry up the tree than all parameters of the images.
     None where one tile sees all images or something has come since they were reconciled (see `tiles_with_outside`), or nobody can tell.
     """
-    states = [state for state in (kept.tile(tile) for tile in tiles) if state is not None]
-    if not tiles or len(states) < len(tiles):
+    known = _known(kept, tiles)
+    if known is None or not _unchanged(source, kept, tiles, *known):
         return None
-    trees = {name: kept.tree(name) for name in {state.tree for state in states}}
-    if any(_stale(tree, kept, tiles) for tree in trees.values()) or any(
-        _changed_owners(source, kept, tile, trees[state.tree].version) for tile, state in zip(tiles, states, strict=True)
-    ):
-        return None
+    states, trees = known
     chosen, p = _first_to_see(states, images), source.image_set(images[:1]).parameters
     if chosen is None or len(chosen) < 2:
         return None
@@ -263,8 +282,7 @@ def combined_with_outside(
     for a, rows in enumerate(places):
         for b, columns in enumerate(places):
             covariance[np.ix_(rows, columns)] += of_parts[ends[a] : ends[a + 1], ends[b] : ends[b + 1]]
-    whole = all(kept.changed.get(tile, 0) <= tree.version for tree in trees.values() for tile in tree.tiles)
-    return CombinedState(images, theta, covariance, whole)
+    return CombinedState(images, theta, covariance, _nothing_since(kept, trees))
 
 
 def _widened(prior: sp.csr_array, images: int, parameters: int) -> sp.csr_array:

@@ -14,6 +14,7 @@ import dask
 import pytest
 from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
+from threadpoolctl import threadpool_info
 
 from orchestration import local_cluster
 from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, ThreadExecutor, executor_for
@@ -220,3 +221,13 @@ def test_past_a_task_that_kills_its_workers() -> None:
 def test_an_input_or_output_error_of_a_task_is_no_lost_scheduler(cluster: LocalCluster) -> None:
     with Client(cluster) as client, pytest.raises(OSError, match="No space left"):
         DaskExecutor(client).submit_all(fail_to_write, [(1,)], "fail", lambda: None)
+
+
+def test_threads_share_the_cores_with_no_threads_of_blas() -> None:
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    before = threads()
+    with executor_for(0):
+        assert threads() == {1}
+    assert threads() == before

@@ -36,6 +36,7 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.network import Network
 from submin.storage.network_store import Snapshot, versions
+from submin.storage.reconciled import read_changes
 from submin.storage.simulated import write_region, write_scene
 from submin.tiling import tile_tree
 
@@ -331,6 +332,38 @@ def test_few_points_of_many_tiles_are_carried_up_the_tree_by_themselves(
     axes = (3 * rows[:, None] + np.arange(3)).ravel()
     np.testing.assert_allclose(found.covariance, covariance[np.ix_(axes, axes)], rtol=0.0, atol=1e-8 * np.abs(covariance).max())
     assert np.abs(found.geocentric - at[rows]).max() < 1e-6
+
+
+def test_few_points_of_tiles_that_nothing_came_to_are_of_those_tiles(
+    fuse: Callable[..., Path], few: list[Block], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A block that comes elsewhere changes nothing that these tiles say, but for whom they speak."""
+    place = fuse(few[:-1])
+    reconcile(str(place), HERE)
+    before = submin.open(place)
+    number = fuse(few[-1:]) and submin.open(place).snapshot.number
+    after = submin.open(place)
+    changed = {tile for tile, version in read_changes(after.snapshot)["changed"].items() if version == number}
+    cover = after.cover
+    untouched = {t for t in after.snapshot.tile_numbers() if not changed & {cover.owner(cell) for cell in cover.cells_held(t)}}
+    cells = [cell for cell in before.cell_numbers() if untouched.issuperset(cover.holders(cell)) and len(before.cell(cell)) > 3]
+    some = np.concatenate([before.cell(cell).point_ids[:4] for cell in (cells[0], cells[-1])])
+    found = []
+    ways: list[bool] = []
+    direct = Network.combined_with_outside
+
+    def noted(*arguments: Any) -> Any:
+        state = direct(*arguments)
+        ways.append(state is not None)
+        return state
+
+    monkeypatch.setattr(Network, "combined_with_outside", noted)
+    for network in (before, after):
+        found.append(network.query(points=some, policy="rigorous"))
+    assert ways == [True, True]
+    assert [answer.scope for answer in found] == ["network", "tiles"]
+    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
+    np.testing.assert_array_equal(found[0].geocentric, found[1].geocentric)
 
 
 def test_islands_are_reconciled_by_themselves(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
