@@ -35,7 +35,8 @@ def plot(rows: Sequence[Mapping[str, Any]], workers: int, out: Path) -> None:
             colour = "0.75" if name == COORDINATOR else f"C{(k + 5 * at) % 10}"
             axes.barh(at, seconds, left=left, color=colour, edgecolor="w", label=None if roomy else f"{stage}: {name}, {seconds:.1f} s")
             if roomy:  # above the line of what was wanted, which may cross it
-                text = axes.text(left + 0.5 * seconds, at, f"{name}\n{seconds:.0f} s", ha="center", va="center", fontsize=8, zorder=3)
+                label = "\n".join([*name.split(", "), f"{seconds:.0f} s"])
+                text = axes.text(left + 0.5 * seconds, at, label, ha="center", va="center", fontsize=8, zorder=3)
                 text.set_bbox({"facecolor": colour, "edgecolor": "none", "pad": 1.0})
             left += seconds
         wanted = next((row["wanted, s"] for row in rows if row.get("stage") == STAGES[stage]), "")
