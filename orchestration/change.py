@@ -351,7 +351,7 @@ def finish(
     touched = [move.cover.cell_name(cell) for report in settled.reports for cell in report.changed]
     touched += [name.removeprefix("cells/") for name in settled.gone if name.startswith("cells/")]
     totals = base.ray_totals().changed(base.summed_cells(set(touched)), summed_cells(root, set(touched)))
-    root.attrs.update({"version": version, "rays": asdict(totals)})
+    root.attrs.update({"version": version, "rays": asdict(totals) | {"version": version}})
     commit(session, version, message)
 
 

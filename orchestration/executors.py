@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from orchestration.local_cluster import Deserted, local_cluster
 from orchestration.memory import give_back, keep_freed, own_peak_memory_mb, seldom_collected
@@ -130,10 +130,12 @@ class ThreadExecutor(SerialExecutor):
 
     def __init__(self, threads: int) -> None:
         self._threads = threads
+        self._libraries = ThreadpoolController()
 
     def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
-        """See `Executor.submit_all`."""
-        with ThreadPoolExecutor(self._threads, thread_name_prefix=name) as pool:
+        """See `Executor.submit_all`. Where tasks run side by side BLAS takes one thread in each: with several they wait for one another."""
+        limit = 1 if len(arguments) > 1 else None
+        with self._libraries.limit(limits=limit, user_api="blas"), ThreadPoolExecutor(self._threads, thread_name_prefix=name) as pool:
             handles = [pool.submit(recorded, name, function, *args) for args in arguments]
             try:
                 done = []
@@ -306,6 +308,8 @@ def _same(value: T) -> T:
 def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Executor]:
     """Threads of this process for no workers; a local cluster of so many processes, one BLAS thread each; or the cluster at an address.
 
+    Threads of this process share its memory: from then on the process keeps what is freed (`keep_freed`).
+
     Raises
     ------
     InputError
@@ -313,7 +317,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
     """
     if scheduler is None and workers <= 0:
         keep_freed()
-        with seldom_collected(), threadpool_limits(1, user_api="blas"):  # BLAS with threads of its own in each thread takes twice as long
+        with seldom_collected():
             yield ThreadExecutor(os.cpu_count() or 1)
         return
     import dask

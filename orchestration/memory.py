@@ -25,11 +25,11 @@ def own_peak_memory_mb() -> float:
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 """Parameters of mallopt, from the C library's malloc.h."""
 KEPT_FREE = {_M_ARENA_MAX: 1, _M_MMAP_THRESHOLD: 32 << 20, _M_TRIM_THRESHOLD: 256 << 20}
-"""One heap for all threads, which keeps what is freed, but for the largest arrays: the system fills every page with zeros first."""
+"""New threads share the heaps that are there, which keep what is freed, but for the largest arrays: a page from the system costs more."""
 
 
 def keep_freed() -> None:
-    """Keep freed memory in this process for what is asked for next, where its C library (glibc) can; `give_back` gives it back."""
+    """Keep freed memory for what is asked for next, from now on in this process, where its C library (glibc) can; see `give_back`."""
     try:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
     except (OSError, AttributeError):

@@ -202,7 +202,7 @@ def fuse_blocks(
     with writing(place), ThreadPoolExecutor(1, thread_name_prefix="directory") as beside:
         known: Snapshot | None
         before = known = Snapshot.open(place)
-        beside.submit(before.directory)  # while the ledger and the first blocks are read
+        directory = beside.submit(before.directory)  # while the ledger and the first blocks are read
         tally = Tally(before.number, {row for _, row in before.flags()})
         new = _new_blocks(blocks, Ledger.of(before), tally, reporter)
         del before
@@ -212,6 +212,7 @@ def fuse_blocks(
             good = [come.block for come in batch if come.reason is None]
             refused = [Rejected.of(come.block, come.reason) for come in batch if come.reason is not None]
             images = {come.block.block_id: come.images for come in batch}
+            directory.result()
             tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points, known))
             known = None  # with all that it has read
             reporter.fused(len(batch))

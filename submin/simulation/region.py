@@ -380,9 +380,8 @@ def _candidates(design: RegionDesign, scene: Array, along: Array, across: Array,
     # Relief moves a point by half its height at most, and the true parameters shift the format.
     margin = 2.0 + 1e-3 * (design.relief_m + coarsest * float(np.abs(theta).sum(axis=1).max()))
     reach = 0.5 * design.scene_km + margin
-    near = (np.abs(scene[:, :1] - along) < reach) & (np.abs(scene[:, 1:] - across) < reach)
-    image, point = np.nonzero(near)
-    return image.astype(np.int32), point.astype(np.int32)
+    points = [np.flatnonzero((np.abs(a - along) < reach) & (np.abs(c - across) < reach)).astype(np.int32) for a, c in scene.tolist()]
+    return np.repeat(np.arange(len(scene), dtype=np.int32), [len(of_image) for of_image in points]), np.concatenate(points)
 
 
 def _measure(design: RegionDesign, exact: Array, size: Array, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:

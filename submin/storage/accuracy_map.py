@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from submin import accuracy
 from submin.adjustment.images import ImageSet
-from submin.geodesy import geocentric_to_geodetic, local_axes, rotate_covariance
+from submin.geodesy import Ellipsoid, geocentric_to_geodetic, local_axes, rotate_covariance
 from submin.network.sub_min import SubMin, covariances_of, locate
 from submin.query.planner import Rows, Selection, ground_parts, points_of_tile, ray_counts
 from submin.query.tile import tile_state
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
-THREADS = min(os.cpu_count() or 1, 8)
-"""Tiles that are worked on side by side."""
+THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
+"""Tiles that are worked on side by side. As many more wait or are read: each has its images' covariance and its points in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class PointAccuracy:
 def accuracy_of_all(network: Network, day: date) -> PointAccuracy:
     """Every determined point, thinned and retired ones too, as policy ``tile`` has it from the tile whose core holds the point.
 
-    Points whose rays determine no position are left out. Memory is that of a few tiles' sub-MINs and of their own points.
+    Points whose rays determine no position are left out. Memory is that of twice `THREADS` tiles: their sub-MINs and own points.
     """
     if network.dense is not None:
         return accuracy_of_dense(network.dense)
@@ -102,7 +102,7 @@ class _Asked:
     tile : its name; selections : the points
     rows : (m,) of the images of their cells in the network; images : these
     state : of the images that see the points
-    retired : (n,) of each selection
+    thinned, retired : (n,) of each cell
     """
 
     tile: str
@@ -110,6 +110,7 @@ class _Asked:
     rows: Index
     images: ImageSet
     state: SubMin
+    thinned: Sequence[NDArray[np.bool_]]
     retired: Sequence[NDArray[np.bool_]]
 
 
@@ -119,12 +120,12 @@ def _read(network: Network, tile: int, selections: Sequence[Selection], day: dat
     images = network.image_set(rows)
     return _Asked(
         network.cover.tile_name(tile), selections, rows, images, tile_state(network, tile, _seeing(selections)),
-        [~network.validity.valid(s.cell.point_ids, day) for s in selections],
+        [~network.left_by_thinning(s.cell) for s in selections], [~network.validity.valid(s.cell.point_ids, day) for s in selections],
     )  # fmt: skip
 
 
 def _seeing(selections: Sequence[Selection]) -> Index:
-    """Rows of the images with a ray of any of the points."""
+    """Rows of the images with a ray, accepted or not, of any of the points."""
     found = []
     for s in selections:
         chosen = np.zeros(len(s.cell), dtype=np.bool_)
@@ -135,14 +136,14 @@ def _seeing(selections: Sequence[Selection]) -> Index:
     return np.unique(np.concatenate(found)).astype(np.int32)
 
 
-def _computed(network: Network, asked: _Asked) -> PointAccuracy:
-    """Accuracy of the points that their rays determine. Nothing is read: several tiles are worked on side by side."""
+def _computed(asked: _Asked, ellipsoid: Ellipsoid) -> PointAccuracy:
+    """Accuracy of the points that their rays determine. Nothing is read, nor anything used that threads may not share."""
     kept, parts = ground_parts(asked.selections, asked.rows, asked.images)
     if not parts:
         return _joined([])
-    geodetic = geocentric_to_geodetic(np.concatenate([locate(part, asked.state) for part in parts]), network.cover.ellipsoid)
+    geodetic = geocentric_to_geodetic(np.concatenate([locate(part, asked.state) for part in parts]), ellipsoid)
     local = rotate_covariance(np.concatenate([covariances_of(part, asked.state) for part in parts]), local_axes(geodetic))
-    retired = {s.cell.number: of_cell for s, of_cell in zip(asked.selections, asked.retired, strict=True)}
+    place = {s.cell.number: k for k, s in enumerate(asked.selections)}
     return PointAccuracy(
         ids=np.concatenate([s.cell.point_ids[s.rows] for s in kept]),
         geodetic=geodetic,
@@ -151,19 +152,19 @@ def _computed(network: Network, asked: _Asked) -> PointAccuracy:
         le90=accuracy.le90(local[:, 2, 2]),
         tile=np.full(len(geodetic), asked.tile),
         rays=np.concatenate([ray_counts(s.cell)[s.rows] for s in kept]),
-        thinned=np.concatenate([~network.left_by_thinning(s.cell)[s.rows] for s in kept]),
-        retired=np.concatenate([retired[s.cell.number][s.rows] for s in kept]),
+        thinned=np.concatenate([asked.thinned[place[s.cell.number]][s.rows] for s in kept]),
+        retired=np.concatenate([asked.retired[place[s.cell.number]][s.rows] for s in kept]),
     )
 
 
 def _of_tiles(network: Network, by_tile: Iterable[tuple[int, Sequence[Selection]]], day: date) -> PointAccuracy:
-    """Accuracy of points by tile: one thread reads, and few tiles are in memory while others compute, whose kernels do not wait."""
+    """Accuracy of points by tile: one thread reads, and few tiles are in memory; their kernels do not wait for it."""
     with ThreadPoolExecutor(THREADS, thread_name_prefix="accuracy") as pool:
         waiting: deque[Future[PointAccuracy]] = deque()
         done = []
         for tile, selections in by_tile:
-            waiting.append(pool.submit(_computed, network, _read(network, tile, selections, day)))
-            if len(waiting) > THREADS:
+            waiting.append(pool.submit(_computed, _read(network, tile, selections, day), network.cover.ellipsoid))
+            if len(waiting) >= 2 * THREADS:
                 done.append(waiting.popleft().result())
         return _joined([*done, *(one.result() for one in waiting)])
 

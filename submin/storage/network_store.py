@@ -239,7 +239,7 @@ def _cover(text: str) -> Cover:
 
 
 class Snapshot:
-    """One version of a network, read only. Everything is read when asked for; only names and the directory are kept."""
+    """One version of a network, read only. Everything is read when asked for; only names, flags and the directory are kept."""
 
     def __init__(self, root: zarr.Group, place: str, cover: Cover | None = None, parameters: int = 0) -> None:
         """``cover`` and ``parameters`` are those of the version being made: its tiles may be finer, its images may need more parameters."""
@@ -330,7 +330,11 @@ class Snapshot:
     def ray_totals(self) -> RayTotals:
         """What the rays of all cells sum to."""
         stated = attributes_of(self.root).get("rays")
-        return self.summed_cells() if stated is None else RayTotals(**stated)
+        changed = read_table(group_of(self.root, "changes"), ["changed"])["changed"]
+        # where another release has changed cells since, they say nothing
+        if stated is None or stated["version"] < changed.max(initial=0):
+            return self.summed_cells()
+        return RayTotals(*(stated[field.name] for field in fields(RayTotals)))
 
     def summed_cells(self, names: Iterable[str] | None = None) -> RayTotals:
         """What the rays of some cells (names) that are there sum to, or of all."""

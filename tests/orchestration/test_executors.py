@@ -14,7 +14,7 @@ import dask
 import pytest
 from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from orchestration import local_cluster
 from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, ThreadExecutor, executor_for
@@ -223,11 +223,15 @@ def test_an_input_or_output_error_of_a_task_is_no_lost_scheduler(cluster: LocalC
         DaskExecutor(client).submit_all(fail_to_write, [(1,)], "fail", lambda: None)
 
 
-def test_threads_share_the_cores_with_no_threads_of_blas() -> None:
+def test_tasks_side_by_side_share_the_cores_with_no_threads_of_blas() -> None:
     def threads() -> set[int]:
         return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
 
-    before = threads()
-    with executor_for(0):
-        assert threads() == {1}
-    assert threads() == before
+    with threadpool_limits(2, user_api="blas"), executor_for(0) as executor:
+        assert threads() == {2}
+        seen = executor.submit_all(threads, [(), ()], "look", lambda: None)
+        assert executor.results(seen) == [{1}, {1}]
+        alone = executor.submit_all(threads, [()], "look", lambda: None)  # it has all cores
+        assert executor.results(alone) == [{2}]
+        assert executor.results([executor.submit(threads, (), "look")]) == [{2}]
+        assert threads() == {2}

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import zarr
 from networks import area_of, fuse, rewrite, same_network
 
 import submin
@@ -19,7 +21,7 @@ from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
 from submin.storage.ledger import Ledger
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.network_store import Snapshot, begin_change, commit, versions
 from submin.storage.writer_lock import writing
 
 HERE = SerialExecutor()
@@ -110,6 +112,27 @@ def test_a_network_of_which_all_is_withdrawn_is_empty_and_can_be_filled(
     assert describe(submin.open(network))["points"] == 0
     assert fuse(catalogue, network, area_of(region)).fused == 12
     same_network(network, complete)
+
+
+@pytest.mark.parametrize("stated", [None, {"version": 0, "rays": 3, "accepted": 2, "pixel_rays": 2, "square_px": 1.0}])
+def test_totals_of_rays_follow_from_the_cells_again(base: Path, blocks: list[Block], stated: dict[str, Any] | None) -> None:
+    """Where there are none, or where they are of before the cells changed, as another release leaves them."""
+    before = Snapshot.open(str(base))
+    session, _ = begin_change(str(base), before.number)
+    root = zarr.open_group(session.store, mode="r+")
+    root.attrs.update({"rays": stated} if stated else {})
+    if stated is None:
+        del root.attrs["rays"]
+    root.attrs["version"] = before.number + 1
+    commit(session, before.number + 1, "another release")
+    assert Snapshot.open(str(base)).ray_totals() == Snapshot.open(str(base)).summed_cells()
+    withdraw(str(base), HERE, block=blocks[3].block_id)
+    after = Snapshot.open(str(base))
+    assert dict(after.root.attrs)["rays"]["version"] == after.number
+    found, expected = after.ray_totals(), after.summed_cells()
+    assert (found.rays, found.accepted, found.pixel_rays) == (expected.rays, expected.accepted, expected.pixel_rays)
+    assert 0 < found.rays < before.ray_totals().rays
+    assert found.square_px == pytest.approx(expected.square_px, rel=1e-9)
 
 
 def test_a_bad_camera_leaves_with_its_block(region: SimulatedRegion, base: Path) -> None:

@@ -510,3 +510,13 @@ def test_a_change_starts_from_the_version_that_its_ledger_was_read_from(tmp_path
     write(place, 1, lambda root: None)
     with pytest.raises(ConflictError, match=r"\(v1 after v0\); nothing of this change was written"):
         begin_change(place, 0)
+
+
+def test_a_version_that_is_open_already_is_used_where_it_is_the_newest(tmp_path: Path) -> None:
+    place = new(tmp_path)
+    known = Snapshot.open(place)
+    assert begin_change(place, 0, known)[1] is known
+    write(place, 1, lambda root: None)
+    with pytest.raises(ConflictError, match=r"\(v1 after v0\); nothing of this change was written"):
+        begin_change(place, 0, known)
+    assert begin_change(place, 1, known)[1].number == 1
