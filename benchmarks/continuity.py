@@ -27,6 +27,7 @@ from benchmarks.comparison import DATA, statement, verdict
 from benchmarks.continuity_figures import plot
 from benchmarks.continuity_measures import CONSISTENT, Measured, in_sigmas, of_scene
 from benchmarks.continuity_scenes import JACKSONVILLE, SCENES, ZY3_AUSTRALIA
+from benchmarks.record import write_record
 from orchestration.executors import executor_for
 from submin.accuracy import accuracy_against_truth
 from submin.tiling.cover import Cover
@@ -46,18 +47,20 @@ MAPS = ((ZY3_AUSTRALIA, 0.0, TILE), (ZY3_AUSTRALIA, 1.0, TILE), (ZY3_AUSTRALIA, 
 
 
 def measure(scale: float, workers: int, out: Path | None = None) -> list[dict[str, Any]]:
-    """Rows of all tables; ``scale`` is the part of each simulated area."""
+    """Rows of all tables; ``scale`` is the part of each simulated area, ``out`` a folder for ``continuity.json`` and figures."""
     with tempfile.TemporaryDirectory() as folder, executor_for(workers) as executor:
         measured = [m for k, scene in enumerate(SCENES) for m in of_scene(scene, Path(folder) / str(k), scale, executor)]
-        if out is not None:
-            plot(measured, PROFILES, MAPS, out)
-        return [
+        rows = [
             *(row for m in measured for row in border_rows(m)),
             *(row for m in measured for row in accuracy_rows(m)),
             *(row for m in measured for row in sheet_rows(m)),
             *(row for m in measured for row in m.singles),
             *claims(measured),
         ]
+        if out is not None:
+            plot(measured, PROFILES, MAPS, out)
+            write_record(out, "continuity", scale, workers, rows)
+        return rows
 
 
 def border_rows(m: Measured) -> Iterator[dict[str, Any]]:

@@ -163,14 +163,19 @@ def carried(done: Elimination, names: Names, weights: Array) -> tuple[Array, Arr
     -------
     noise (n, k), of z, and weights (n, b) of the boundary's vectors.
     """
+    return carried_together(done, [(np.arange(len(weights)), names, weights)], len(weights))
+
+
+def carried_together(done: Elimination, parts: Sequence[tuple[NDArray[np.int64], Names, Array]], count: int) -> tuple[Array, Array]:
+    """`carried` for ``count`` sums of functionals; of each part the sums that it belongs to (rows, each once), its vectors and weights."""
     whole = np.concatenate([done.interior, done.boundary])
     order = np.argsort(whole)
-    at = order[np.searchsorted(whole, names, sorter=order)]
-    every = np.zeros((len(weights), len(whole)))
-    every[:, at] = weights
+    every = np.zeros((count, len(whole)))
+    for rows, names, weights in parts:
+        every[np.ix_(rows, order[np.searchsorted(whole, names, sorter=order)])] += weights
     k = len(done.interior)
     if not k:
-        return np.zeros((len(weights), 0)), every
+        return np.zeros((count, 0)), every
     noise = la.solve_triangular(done.root[:k], every[:, :k].T, lower=True).T
     return noise, every[:, k:] - noise @ done.root[k:].T
 

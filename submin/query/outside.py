@@ -24,7 +24,7 @@ from submin.adjustment.elimination import Sums
 from submin.adjustment.estimation import cholesky
 from submin.adjustment.symmetric import between, fill_symmetric
 from submin.network.cell import kept_rows
-from submin.network.outside_messages import Elimination, carried
+from submin.network.outside_messages import Elimination, carried, carried_together
 from submin.network.sub_min import CombinedState, SubMin, add_sums
 from submin.network.whitened_vectors import Vectors, first_rows
 from submin.query.source import NetworkSource
@@ -267,22 +267,15 @@ def combined_with_outside(
     chosen, p = _first_to_see(states, images), source.image_set(images[:1]).parameters
     if chosen is None or len(chosen) < 2:
         return None
-    parts, places, theta = [], [], np.zeros((len(images), p))
+    parts, theta = [], np.zeros((len(images), p))
     for k, rows in chosen:
         columns, prior = states[k].vectors.seen(images[rows])
         wide = _widened(prior, len(rows), p)
         theta[rows] = np.asarray(wide @ states[k].mean[columns]).reshape(-1, p)
         of_images = loading[:, _rows_of(rows, p)]
         concerned = np.flatnonzero(np.diff(of_images.indptr))
-        parts.append(Functionals(tiles[k], columns, sp.csr_array(of_images[concerned] @ wide)))
-        places.append(concerned)
-    covariance = np.zeros((loading.shape[0], loading.shape[0]))
-    ends = np.cumsum([0, *map(len, places)])
-    _, of_parts = joint(kept, parts)
-    for a, rows in enumerate(places):
-        for b, columns in enumerate(places):
-            covariance[np.ix_(rows, columns)] += of_parts[ends[a] : ends[a + 1], ends[b] : ends[b + 1]]
-    return CombinedState(images, theta, covariance, _nothing_since(kept, trees))
+        parts.append((Functionals(tiles[k], columns, sp.csr_array(of_images[concerned] @ wide)), concerned))
+    return CombinedState(images, theta, _summed_noise(kept, parts, loading.shape[0]), _nothing_since(kept, trees))
 
 
 def _widened(prior: sp.csr_array, images: int, parameters: int) -> sp.csr_array:
@@ -333,6 +326,39 @@ def _way_up(kept: Reconciled, part: Functionals) -> dict[tuple[str, int], Array]
         noise[state.tree, node], weights = carried(done, names, weights)
         names, node = done.boundary, parents[node]
     return noise
+
+
+def _summed_noise(kept: Reconciled, parts: Sequence[tuple[Functionals, NDArray[np.int64]]], count: int) -> Array:
+    """Covariance (n, n) of ``count`` sums of combinations of the vectors of several tiles; of each part also the sums that it belongs to.
+
+    All of it is noise of the nodes above the tiles. What tiles add to the same sum is one combination from the node on where their ways
+    meet, so the large nodes near the root are passed once.
+    """
+    arriving: dict[tuple[str, int], list[tuple[NDArray[np.int64], Names, Array]]] = {}
+    depth: dict[tuple[str, int], int] = {}
+    for part, sums in parts:
+        state = kept.tile(part.tile)
+        assert state is not None
+        weights = np.zeros((len(sums), len(state.vectors.names)))
+        weights[:, part.columns] = part.weights.toarray()
+        arriving.setdefault((state.tree, state.node), []).append((sums, state.vectors.names, weights))
+        way, node, parents = [], state.node, kept.tree(state.tree).parents
+        while node >= 0:
+            way.append((state.tree, node))
+            node = parents[node]
+        depth.update((key, len(way) - k) for k, key in enumerate(way))
+    covariance = np.zeros((count, count))
+    for tree, node in sorted(depth, key=lambda key: -depth[key]):  # children before their parents
+        come = arriving.pop((tree, node))
+        sums = np.unique(np.concatenate([of_part for of_part, _, _ in come]))
+        done = kept.elimination(tree, node)
+        here = [(np.searchsorted(sums, of_part), names, given) for of_part, names, given in come]
+        noise, weights = carried_together(done, here, len(sums))
+        covariance[np.ix_(sums, sums)] += noise @ noise.T
+        parent = kept.tree(tree).parents[node]
+        if parent >= 0:
+            arriving.setdefault((tree, parent), []).append((sums, done.boundary, weights))
+    return covariance
 
 
 def _with_increments(
