@@ -230,12 +230,13 @@ def _as_reconciled(
         parts.append(Functionals(tiles[k], columns, _widened(prior, len(rows), parameters)))
         order.append(_rows_of(rows, parameters))
     mean, covariance = joint(kept, parts)
-    place = np.argsort(np.concatenate([np.empty(0, dtype=np.int64), *order]))
+    if len(parts) > 1:  # of one tile they are in order
+        place = np.argsort(np.concatenate(order))
+        mean, covariance = mean[place], covariance[np.ix_(place, place)]
     chi_square = sum(tree.chi_square for tree in trees.values())
     redundancy = sum(tree.redundancy for tree in trees.values())
     return SubMin(
-        images, mean[place].reshape(-1, parameters), covariance[np.ix_(place, place)], chi_square, redundancy,
-        whole=_nothing_since(kept, trees),
+        images, mean.reshape(-1, parameters), covariance, chi_square, redundancy, whole=_nothing_since(kept, trees)
     )  # fmt: skip
 
 
@@ -295,10 +296,14 @@ def joint(kept: Reconciled, parts: Sequence[Functionals]) -> tuple[Array, Array]
     Of one tile they come from its own state. Those of two are carried up the tree: what they have in common is the noise of the nodes on
     both ways to the root. Different parts of the network are independent.
     """
+    if len(parts) == 1:  # a large matrix is made once
+        (part,), state = parts, kept.tile(parts[0].tile)
+        assert state is not None
+        return part.weights @ state.mean[part.columns], between(part.weights, kept.covariance(part.tile, part.columns))
     ends = np.cumsum([0, *(part.weights.shape[0] for part in parts)])
     mean, covariance = np.empty(ends[-1]), np.zeros((ends[-1], ends[-1]))
     passing: dict[tuple[str, int], list[tuple[int, Array]]] = {}
-    for k, part in enumerate(parts if len(parts) > 1 else ()):
+    for k, part in enumerate(parts):
         for node, noise in _way_up(kept, part).items():
             passing.setdefault(node, []).append((k, noise))
     for ways in passing.values():

@@ -265,7 +265,7 @@ class ReconciledStore:
     def covariance(self, tile: int, columns: NDArray[np.int64]) -> Array:
         """Covariance (k, k) of some of the tile's vectors (columns, ascending), both triangles.
 
-        Of a tile that is asked for again the whole is kept in memory.
+        Of a tile that is asked for again the whole is kept in memory; it must not be changed.
         """
         whole = self._covariances.get(tile)
         if whole is None:
@@ -274,7 +274,7 @@ class ReconciledStore:
                 self._asked.add(tile)
                 return read_symmetric(group, "covariance", columns)
             whole = self._covariances.put(tile, read_symmetric(group, "covariance"))
-        return whole[np.ix_(columns, columns)]
+        return whole if len(columns) == len(whole) else whole[np.ix_(columns, columns)]
 
     def elimination(self, tree: str, node: int) -> Elimination:
         """What was eliminated at a node; the latest used ones are kept in memory."""
