@@ -71,9 +71,7 @@ def command(
     network: Annotated[Path | None, typer.Option(help="query: a network that is there already, in place of a new one.")] = None,
     figures: Annotated[
         Path | None,
-        typer.Option(
-            "--out", help="Folder for figures: five-blocks, worldview, correlation, continuity; for rows: peers, china, scaling, query"
-        ),
+        typer.Option("--out", help=f"Folder for figures and records, of {', '.join(WITH_OUT)}."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:

@@ -348,9 +348,9 @@ def finish(
     metadata = replace(base.metadata, cover=move.cover.to_mapping(), parameters=move.parameters)
     if metadata != base.metadata:
         root.attrs.update(metadata.to_attributes())
-    touched = [move.cover.cell_name(cell) for report in settled.reports for cell in report.changed]
-    touched += [name.removeprefix("cells/") for name in settled.gone if name.startswith("cells/")]
-    totals = base.ray_totals().changed(base.summed_cells(set(touched)), summed_cells(root, set(touched)))
+    touched = {move.cover.cell_name(cell) for report in settled.reports for cell in report.changed}
+    touched |= {name.removeprefix("cells/") for name in settled.gone if name.startswith("cells/")}
+    totals = base.ray_totals().changed(summed_cells(base.root, touched), summed_cells(root, touched))
     root.attrs.update({"version": version, "rays": asdict(totals) | {"version": version}})
     commit(session, version, message)
 

@@ -11,15 +11,14 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import Any
 
-from orchestration.memory import seldom_collected
+from orchestration.memory import KEPT_FREE, seldom_collected
 from submin.query.warm_up import compile_kernels
 
 GIVEN_UP = 120.0
 """Seconds without a single worker after which none is waited for: a killed one comes again in a few, on a busy machine in tens of them."""
 LOOKED_EVERY = 1.0
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-MEMORY = {"MALLOC_ARENA_MAX": "1", "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
-"""Of glibc: freed memory is used again as it is, not given to the system and cleared anew for each array (`memory.give_back` does that)"""
+MEMORY = {name: str(value) for name, _, value in KEPT_FREE}
 SETTINGS = {
     "distributed.nanny.pre-spawn-environ": {**THREADS, **MEMORY},  # set before the workers load numpy
     # Dask would look at every stack a hundred times a second; what tasks took is in the run's record

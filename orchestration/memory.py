@@ -22,10 +22,9 @@ def own_peak_memory_mb() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-"""Parameters of mallopt, from the C library's malloc.h."""
-KEPT_FREE = {_M_ARENA_MAX: 1, _M_MMAP_THRESHOLD: 32 << 20, _M_TRIM_THRESHOLD: 256 << 20}
-"""New threads share the heaps that are there, which keep what is freed, but for the largest arrays: a page from the system costs more."""
+KEPT_FREE = (("MALLOC_ARENA_MAX", -8, 1), ("MALLOC_MMAP_THRESHOLD_", -3, 32 << 20), ("MALLOC_TRIM_THRESHOLD_", -1, 256 << 20))
+"""Settings of glibc by the name in a process's environment and by their number in its malloc.h: new threads share the heaps that are there,
+which keep what is freed, but for the largest arrays. Otherwise each array would be cleared anew, page by page, by the system."""
 
 
 def keep_freed() -> None:
@@ -34,7 +33,7 @@ def keep_freed() -> None:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
     except (OSError, AttributeError):
         return
-    for parameter, value in KEPT_FREE.items():
+    for _, parameter, value in KEPT_FREE:
         mallopt(parameter, value)
 
 

@@ -158,7 +158,7 @@ def _computed(asked: _Asked, ellipsoid: Ellipsoid) -> PointAccuracy:
 
 
 def _of_tiles(network: Network, by_tile: Iterable[tuple[int, Sequence[Selection]]], day: date) -> PointAccuracy:
-    """Accuracy of points by tile: one thread reads, and few tiles are in memory; their kernels do not wait for it."""
+    """Accuracy of points by tile: this thread reads, others compute; at most twice `THREADS` tiles are in memory."""
     with ThreadPoolExecutor(THREADS, thread_name_prefix="accuracy") as pool:
         waiting: deque[Future[PointAccuracy]] = deque()
         done = []

@@ -226,7 +226,7 @@ class RayTotals:
 
 
 def summed_cells(root: zarr.Group, names: Iterable[str] | None = None) -> RayTotals:
-    """See `Snapshot.summed_cells`; ``root`` may be of a version that is being written."""
+    """What the rays of some cells (names) that are there sum to, or of all; ``root`` may be of a version that is being written."""
     group = group_of(root, "cells")
     cells = [cell for cell in read_attributes(group, member_names(group) if names is None else names) if cell is not None]
     return RayTotals(*(sum(cell[field.name] for cell in cells) for field in fields(RayTotals)))
@@ -333,12 +333,8 @@ class Snapshot:
         changed = read_table(group_of(self.root, "changes"), ["changed"])["changed"]
         # where another release has changed cells since, they say nothing
         if stated is None or stated["version"] < changed.max(initial=0):
-            return self.summed_cells()
+            return summed_cells(self.root)
         return RayTotals(*(stated[field.name] for field in fields(RayTotals)))
-
-    def summed_cells(self, names: Iterable[str] | None = None) -> RayTotals:
-        """What the rays of some cells (names) that are there sum to, or of all."""
-        return summed_cells(self.root, names)
 
     def tile_numbers(self) -> tuple[int, ...]:
         """Tiles that have a sub-MIN, ascending."""

@@ -12,7 +12,7 @@ from submin.errors import SubminError
 from submin.network.network_image import image_set
 from submin.storage.arrays import group_of, read_table
 from submin.storage.ledger import Entry
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.network_store import Snapshot, summed_cells, versions
 from submin.storage.problems import DAMAGE, Problem, first_line, some
 from submin.storage.schema import FLAG_COLUMNS, IMAGE_COLUMNS, LEDGER_COLUMNS
 from submin.storage.verify_tile import CellContents
@@ -67,7 +67,7 @@ def verify_history(snapshot: Snapshot) -> list[Problem]:
 
 def _ray_totals(snapshot: Snapshot) -> list[Problem]:
     """Totals follow every change of a cell; squares are added up in another order."""
-    stated, found = snapshot.ray_totals(), snapshot.summed_cells()
+    stated, found = snapshot.ray_totals(), summed_cells(snapshot.root)
     near = abs(stated.square_px - found.square_px) <= 1e-6 * max(found.square_px, 1.0)
     if near and replace(stated, square_px=found.square_px) == found:
         return []

@@ -299,6 +299,20 @@ def test_points_of_several_tiles_stay_exact_as_blocks_come(fuse: Callable[..., P
     assert np.abs(found_at - at).max() < 1e-6
 
 
+def ways_noted(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Grows by whether a question was answered by combinations of images alone, for each that could have been."""
+    ways: list[bool] = []
+    direct = Network.combined_with_outside
+
+    def noted(*arguments: Any) -> Any:
+        state = direct(*arguments)
+        ways.append(state is not None)
+        return state
+
+    monkeypatch.setattr(Network, "combined_with_outside", noted)
+    return ways
+
+
 def test_few_points_of_many_tiles_are_carried_up_the_tree_by_themselves(
     fuse: Callable[..., Path], few: list[Block], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -308,15 +322,7 @@ def test_few_points_of_many_tiles_are_carried_up_the_tree_by_themselves(
     network = submin.open(place)
     every, _, _ = points(network, network.snapshot.tile_numbers(), whole := truth(network))
     some = np.sort(np.random.default_rng(3).choice(every, 12, replace=False))
-    ways: list[bool] = []
-    direct = Network.combined_with_outside
-
-    def noted(*arguments: Any) -> Any:
-        found = direct(*arguments)
-        ways.append(found is not None)
-        return found
-
-    monkeypatch.setattr(Network, "combined_with_outside", noted)
+    ways = ways_noted(monkeypatch)
     found = network.query(points=some, policy="rigorous")
     assert ways == [True]
     assert len(found.tiles) > 3
@@ -348,18 +354,8 @@ def test_few_points_of_tiles_that_nothing_came_to_are_of_those_tiles(
     untouched = {t for t in after.snapshot.tile_numbers() if not changed & {cover.owner(cell) for cell in cover.cells_held(t)}}
     cells = [cell for cell in before.cell_numbers() if untouched.issuperset(cover.holders(cell)) and len(before.cell(cell)) > 3]
     some = np.concatenate([before.cell(cell).point_ids[:4] for cell in (cells[0], cells[-1])])
-    found = []
-    ways: list[bool] = []
-    direct = Network.combined_with_outside
-
-    def noted(*arguments: Any) -> Any:
-        state = direct(*arguments)
-        ways.append(state is not None)
-        return state
-
-    monkeypatch.setattr(Network, "combined_with_outside", noted)
-    for network in (before, after):
-        found.append(network.query(points=some, policy="rigorous"))
+    ways = ways_noted(monkeypatch)
+    found = [network.query(points=some, policy="rigorous") for network in (before, after)]
     assert ways == [True, True]
     assert [answer.scope for answer in found] == ["network", "tiles"]
     np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
