@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import shapely
@@ -79,7 +80,7 @@ def points_in_area(source: NetworkSource, area: BaseGeometry, every: bool = Fals
     """
     selections = []
     for cell in source.some_cells(cells_near(source, area)):
-        at = geocentric_to_geodetic(cell.linearised_at, source.cover.ellipsoid)
+        at = source.kept(("geodetic", cell.number), partial(geocentric_to_geodetic, cell.linearised_at, source.cover.ellipsoid))
         inside = np.asarray(shapely.intersects_xy(area, at[:, 0], at[:, 1]), dtype=bool)
         if every:
             at = geocentric_to_geodetic(cell.origin, source.cover.ellipsoid)
