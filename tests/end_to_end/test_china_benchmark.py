@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.china import STAGE_NAMES, whole
+from benchmarks.china import STAGE_NAMES, STREAMED, whole
 from benchmarks.china_figure import COORDINATOR, parts_of, plot
 from benchmarks.comparison import MET
 from benchmarks.held_back import held_back
@@ -24,11 +24,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_small_part_goes_through_every_stage(folder: Path) -> None:
     stages, tasks, found = whole(folder, SCALE, 0)
     assert [row["stage"] for row in stages] == list(STAGE_NAMES)
-    assert stages[1]["blocks"] == stages[0]["blocks"] - 1
+    assert stages[1]["blocks"] == stages[0]["blocks"] - STREAMED
     assert {row["task"] for row in tasks} >= {"adjust", "update-tile", "factor-tile", "collect-tile", "distribute-tile"}
     told = {row["claim"]: row["verdict"] for row in found}
     assert [told[claim] for claim in told if "against it" in claim or "mosaic" in claim] == [MET] * 3
-    assert Catalogue.open(folder / "one").block_count == 1
+    assert [Catalogue.open(single).block_count for single in (folder / "singles").iterdir()] == [1] * STREAMED
 
     rows = [*stages, *tasks]
     parts = dict(parts_of(rows, "run", 1))
@@ -37,13 +37,13 @@ def test_a_small_part_goes_through_every_stage(folder: Path) -> None:
     assert (folder / "figures" / "china.png").stat().st_size > 10_000
 
 
-def test_the_two_catalogues_are_the_one(folder: Path) -> None:
+def test_what_is_held_back_and_the_rest_are_the_whole(folder: Path) -> None:
     made = submin_json("simulate", "china", "--out", folder / "whole", "--scale", 0.0005)
-    block_id = held_back(folder / "whole", 1, folder / "others", folder / "single")
-    whole_one, others, single = (Catalogue.open(folder / name) for name in ("whole", "others", "single"))
-    assert single.block_ids == (block_id,) and {*others.block_ids, block_id} == {*whole_one.block_ids}
-    assert made["blocks"] == whole_one.block_count
-    hashes = {block.block_id: block.content_hash() for part in (others, single) for block in part.blocks()}
+    folders = held_back(folder / "whole", [1, 3], folder / "others", folder / "each")
+    whole_one, *parts = (Catalogue.open(place) for place in (folder / "whole", folder / "others", *folders))
+    assert [part.block_ids for part in parts[1:]] == [(whole_one.block_ids[at],) for at in (1, 3)]
+    assert made["blocks"] == whole_one.block_count == sum(part.block_count for part in parts)
+    hashes = {block.block_id: block.content_hash() for part in parts for block in part.blocks()}
     assert hashes == {block.block_id: block.content_hash() for block in whole_one.blocks()}
 
 
