@@ -29,6 +29,8 @@ class Executor(Protocol):
     """Runs tasks. A *handle* stands for a result that stays where it was made; it can be an argument of a later task."""
 
     workers: int
+    beside: bool
+    """Whether tasks run in processes beside this one, which see the same files."""
 
     def share(self, value: Any) -> Any:
         """Make a value known to all workers once; the answer is a handle."""
@@ -78,6 +80,7 @@ class SerialExecutor:
     """Runs every task here and at once."""
 
     workers = 1
+    beside = False
 
     def share(self, value: Any) -> Any:
         """See `Executor.share`."""
@@ -157,7 +160,7 @@ class DaskExecutor:
     def __init__(self, client: Any, deserted: Deserted | None = None) -> None:
         """``deserted`` tells of workers of this machine, where they are, whether all are gone for good."""
         self.client = client
-        self._deserted = deserted
+        self._deserted, self.beside = deserted, deserted is not None
         self.workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
         self._address = client.scheduler.address
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import chain, islice
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ from submin.storage.control_blocks import control_blocks, observed_positions, po
 from submin.storage.ledger import Ledger
 from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import writing
+
+T = TypeVar("T")
 
 DEFAULT_BATCH_BLOCKS = 2000
 BLOCKS_TOGETHER = 64
@@ -150,10 +153,11 @@ def run(
     """
     started, reporter = time.monotonic(), reporter or Silent()
     check_frames(catalogue, Snapshot.open(place))
-    summary = catalogue.validate()
+    validated = _validation(catalogue, executor)
     control = catalogue.points("control")
     observed = observation_blocks(catalogue)
-    reporter.begin(summary.blocks + (0 if control is None else len(control)) + summary.clusters)
+    clusters = sum(1 for _ in catalogue.observations())
+    reporter.begin(catalogue.block_count + (0 if control is None else len(control)) + clusters)
     every = chain(
         catalogue.blocks(),
         () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control"),
@@ -161,11 +165,27 @@ def run(
     )
     check = catalogue.points("check")
     tally = fuse_blocks(
-        every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids
+        every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids, validated
     )
     after = Snapshot.open(place)
     # another run may have gone on meanwhile
     return _result(after if after.number == tally.version else Snapshot.open(place, f"v{tally.version}"), tally, started, executor)
+
+
+def _validation(catalogue: Catalogue, executor: Executor) -> Callable[[], object]:
+    """Look through the whole catalogue for structural errors; what is returned waits for it to be done, and raises what was found.
+
+    A worker that sees the same files does it, while the first blocks are read here.
+    """
+    if not executor.beside:
+        catalogue.validate()
+        return lambda: None
+    handle = executor.submit(_validate, (catalogue.path,), "validate")
+    return lambda: executor.results([handle])
+
+
+def _validate(path: Path) -> None:
+    Catalogue.open(path).validate()
 
 
 def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:
@@ -188,9 +208,11 @@ def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:
 
 def fuse_blocks(
     blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter, innovation: float = REJECTED,
-    check_points: NDArray[np.str_] | None = None,
+    check_points: NDArray[np.str_] | None = None, validated: Callable[[], object] = lambda: None,
 ) -> Tally:  # fmt: skip
     """Fuse those of some blocks that the network does not have yet, so many to a commit; it remembers ``check_points`` with them.
+
+    ``validated`` is called before anything is written: what it raises ends the run.
 
     Raises
     ------
@@ -206,7 +228,7 @@ def fuse_blocks(
         tally = Tally(before.number, {row for _, row in before.flags()})
         new = _new_blocks(blocks, Ledger.of(before), tally, reporter)
         del before
-        for number, batch in enumerate(batches_ahead(_with_images(new), max(batch_blocks, 1))):
+        for number, batch in enumerate(_once(validated, batches_ahead(_with_images(new), max(batch_blocks, 1)))):
             if number:
                 executor.give_back()
             good = [come.block for come in batch if come.reason is None]
@@ -217,6 +239,18 @@ def fuse_blocks(
             known = None  # with all that it has read
             reporter.fused(len(batch))
     return tally
+
+
+def _once(validated: Callable[[], object], batches: Iterator[T]) -> Iterator[T]:
+    """Batches, none of them before all is known to be sound. Where the first cannot even be read, validation says better why."""
+    first: list[T] = []
+    try:
+        first += islice(batches, 1)
+    finally:
+        validated()
+    while first:
+        yield first.pop()  # kept here no longer than where it is used
+    yield from batches
 
 
 def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -> RunResult:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from networks import accepted_rays, area_of, by_image, fuse, rewrite, same_network
 
@@ -14,6 +17,7 @@ from orchestration.create import create
 from orchestration.executors import SerialExecutor, executor_for
 from orchestration.progress import Silent
 from orchestration.run import run
+from submin.errors import CatalogueError
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.network_store import Snapshot, versions
@@ -56,6 +60,27 @@ def test_workers_leave_the_same_network(region: SimulatedRegion, catalogue: Path
     with executor_for(2) as executor:
         assert fuse(catalogue, network, area_of(region), executor=executor).fused == 12
     same_network(base, network)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize(
+    ("table", "column", "value", "said"),
+    [
+        ("measurements", "image_id", "nobody", r"measurements.parquet: row 1052: image_id is 'nobody', which the images table does not"),
+        ("images", "camera", "{", r"images.parquet: row 36: image .* camera is not JSON"),
+    ],
+)
+def test_an_error_at_the_end_of_a_catalogue_comes_before_the_first_commit(
+    region: SimulatedRegion, catalogue: Path, tmp_path: Path, workers: int, table: str, column: str, value: str, said: str
+) -> None:
+    """Wherever the catalogue is looked through, beside the reading of the first blocks or before it."""
+    bad = Path(shutil.copytree(catalogue, tmp_path / "catalogue"))
+    rows = pq.read_table(bad / f"{table}.parquet")
+    values = [*rows[column].to_pylist()[:-1], value]
+    pq.write_table(rows.set_column(rows.schema.get_field_index(column), column, pa.array(values)), bad / f"{table}.parquet")
+    with executor_for(workers) as executor, pytest.raises(CatalogueError, match=said):
+        fuse(bad, tmp_path / "network", area_of(region), executor=executor, batch_blocks=1)
+    assert Snapshot.open(str(tmp_path / "network")).number == 0
 
 
 def test_changed_content_and_returning_images_are_rejected(region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path) -> None:
