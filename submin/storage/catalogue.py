@@ -1,4 +1,4 @@
-"""Reading a catalogue: images in memory, measurements streamed block by block, and a full scan for structural errors.
+"""Reading a catalogue: names of images in memory, measurements streamed block by block, and a full scan for structural errors.
 
 Tables are read by `submin.formats.columns`. Whatever is wrong with the structure of a catalogue (columns, types, unknown images,
 order) raises `CatalogueError`; what is wrong inside one block is left to `defects`.
@@ -23,13 +23,9 @@ from shapely.geometry.base import BaseGeometry
 from submin.adjustment.priors import APriori
 from submin.errors import CatalogueError, InputError
 from submin.formats.columns import (
-    Column,
     empty_table,
-    integer,
     number,
     number_values,
-    read_table,
-    refuse,
     required_path,
     table_path,
     table_runs,
@@ -37,9 +33,7 @@ from submin.formats.columns import (
     text_values,
 )
 from submin.network.observations import Cluster
-from submin.sensors import SENSORS, SURVEYS
 from submin.storage.catalogue_schema import (
-    CONTROL_PREFIX,
     DEFAULT_SIGMA_PX,
     POINT_KINDS,
     Block,
@@ -49,17 +43,13 @@ from submin.storage.catalogue_schema import (
     PointTable,
     defects,
 )
+from submin.storage.image_rows import IMAGE_COLUMNS, ImageRows
 from submin.storage.observation_table import STEM as OBSERVATIONS
 from submin.storage.observation_table import read_clusters
 from submin.storage.point_table import Covariances, read_point_table
 
 T = TypeVar("T")
 
-IMAGE_COLUMNS = (
-    text("image_id"), text("block_id"), text("pass_id"), text("platform", blank=True), text("sensor"), text("camera"),
-    integer("width"), integer("height"), text("acquired", False, blank=True), Column("geometry", pa.binary(), False),
-    text("licence", False, blank=True),
-)  # fmt: skip
 MEASUREMENT_COLUMNS = (
     text("block_id"), text("image_id"), text("point_id"), number("sample"), number("line"),
     number("sigma_sample", False), number("sigma_line", False),
@@ -70,20 +60,20 @@ _COVARIANCE_OF: dict[Literal["control", "check", "truth"], Covariances] = {"cont
 
 @dataclass(frozen=True, eq=False)
 class Catalogue:
-    """A catalogue on disk: images and priors in memory, measurements and other observations read as they are needed.
+    """A catalogue on disk: names of images and priors in memory, measurements and other observations read as they are needed.
 
     Attributes
     ----------
     path : its folder
     metadata : body, ellipsoid, frame
-    images : all images, in catalogue order; none in a catalogue of other observations or of control alone
+    images : all images, in catalogue order, made as they are asked for; none in a catalogue of other observations or of control alone
     default_prior : a priori model of blocks without an entry of their own
     priors : a priori model by block
     """
 
     path: Path
     metadata: CatalogueMetadata
-    images: tuple[ImageRecord, ...]
+    images: ImageRows
     default_prior: APriori
     priors: Mapping[str, APriori]
 
@@ -102,34 +92,34 @@ class Catalogue:
         if not folder.is_dir():
             raise CatalogueError(f"{folder}: no such folder; expected a catalogue (a folder with catalogue.json)")
         metadata = _from_json(folder / "catalogue.json", CatalogueMetadata.from_mapping)
-        images: tuple[ImageRecord, ...] = ()
+        images = ImageRows.none()
         if _needs_images(folder):
-            images = _read_images(required_path(folder, "images"))
+            images = ImageRows.read(required_path(folder, "images"))
             required_path(folder, "measurements")
         default, priors = APriori(), dict[str, APriori]()
         if (folder / "priors.json").exists():
             default, priors = _from_json(folder / "priors.json", _priors)
-            unknown = sorted(set(priors) - {image.block_id for image in images})
+            unknown = sorted(set(priors) - set(images.blocks))
             if unknown:
                 raise CatalogueError(f"{folder / 'priors.json'}: block {unknown[0]!r} has no image; expected blocks of the images table")
         return cls(folder, metadata, images, default, priors)
 
     @cached_property
-    def _images_of(self) -> dict[str, tuple[ImageRecord, ...]]:
-        members: dict[str, list[ImageRecord]] = {}
-        for image in self.images:
-            members.setdefault(image.block_id, []).append(image)
-        return {block_id: tuple(images) for block_id, images in members.items()}
+    def _rows_of(self) -> dict[str, NDArray[np.int64]]:
+        """Rows of the images of each block."""
+        order = np.argsort(self.images.block_of, kind="stable")
+        parts = np.split(order, np.cumsum(np.bincount(self.images.block_of))[:-1]) if len(order) else []
+        return dict(zip(self.images.blocks, parts, strict=True))
 
     @property
     def block_ids(self) -> tuple[str, ...]:
         """Blocks in the order in which the images table names them."""
-        return tuple(self._images_of)
+        return self.images.blocks
 
     @property
     def block_count(self) -> int:
         """Number of blocks."""
-        return len(self._images_of)
+        return len(self.images.blocks)
 
     def a_priori(self, block_id: str) -> APriori:
         """What is believed of the cameras of a block."""
@@ -161,7 +151,7 @@ class Catalogue:
         """One block; raises `CatalogueError` for an unknown one."""
         if not self.images:
             raise CatalogueError(f"{self.path}: no block {block_id!r}; the catalogue has no images")
-        if block_id not in self._images_of:
+        if block_id not in self._rows_of:
             few, more = self.block_ids[:5], self.block_count - 5
             names = "one of " * (self.block_count > 1) + ", ".join(few) + (f" and {more:,} more" if more > 0 else "")
             raise CatalogueError(f"{self.path}: no block {block_id!r}; expected {names}")
@@ -223,15 +213,14 @@ class Catalogue:
 
     def _image_index(self, block_id: str, row: int, table: pa.Table, path: Path) -> NDArray[np.int32]:
         """Index of each ray's image among the images of its block; ``row`` is the number of the table's first row in its file."""
-        if block_id not in self._images_of:
+        if block_id not in self._rows_of:
             raise CatalogueError(f"{path}: row {row}: block_id is {block_id!r}; expected a block of the images table")
-        image_ids = pa.array([image.image_id for image in self._images_of[block_id]], pa.string())
-        index = pc.index_in(table["image_id"], value_set=image_ids)
+        index = pc.index_in(table["image_id"], value_set=self.images.ids.take(self._rows_of[block_id]))
         if index.null_count:
             k = int(np.argmax(pc.is_null(index).to_numpy()))
             image_id = table["image_id"][k].as_py()
-            others = [image.block_id for image in self.images if image.image_id == image_id]
-            found = f"an image of block {others[0]!r}" if others else "which the images table does not have"
+            other = pc.index(self.images.ids, image_id).as_py()
+            found = "which the images table does not have" if other < 0 else f"an image of block {self.images[other].block_id!r}"
             raise CatalogueError(f"{path}: row {row + k}: image_id is {image_id!r}, {found}; expected an image of block {block_id!r}")
         return np.asarray(index.to_numpy(), dtype=np.int32)
 
@@ -239,7 +228,7 @@ class Catalogue:
         image = self._image_index(block_id, row, table, path)
         return Block(
             block_id,
-            self._images_of[block_id],
+            self.images.take(self._rows_of[block_id]),
             self.a_priori(block_id),
             text_values(table, "point_id"),
             image,
@@ -302,40 +291,6 @@ def _over(default: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any
     inner = [values.get("parameters", {}) for values in (default, entry)]
     merged = {**default, **entry}
     return merged | {"parameters": {**inner[0], **inner[1]}} if all(isinstance(values, dict) for values in inner) else merged
-
-
-def _read_images(path: Path) -> tuple[ImageRecord, ...]:
-    table = read_table(path, IMAGE_COLUMNS)
-    for name in ("width", "height"):
-        refuse(pc.is_null(table[name]), table[name], name, path, 1, "a number of pixels")
-    optional = {"acquired": "", "geometry": b"", "licence": ""}
-    names = [c.name for c in IMAGE_COLUMNS if c.name in table.schema.names]
-    images: list[ImageRecord] = []
-    first_row: dict[str, int] = {}
-    for row, values in enumerate(zip(*(table[name].to_pylist() for name in names), strict=True), start=1):
-        record = {**optional, **dict(zip(names, values, strict=True))}
-        record["footprint"] = record.pop("geometry") or b""
-        try:
-            image = ImageRecord(**record)
-            of_images = [name for name, sensor in SENSORS.items() if sensor.parameters and name not in SURVEYS]
-            if image.sensor in SENSORS and image.sensor not in of_images:  # views that the program makes itself
-                raise InputError(f"sensor is {image.sensor!r}, which is none of images; expected one of {', '.join(of_images)}")
-        except InputError as error:
-            raise CatalogueError(f"{path}: row {row}: {error}") from None
-        if image.image_id in first_row:
-            raise CatalogueError(
-                f"{path}: row {row}: image_id {image.image_id!r} is that of row {first_row[image.image_id]} too; expected it once"
-            )
-        for name, value in (("image_id", image.image_id), ("block_id", image.block_id)):
-            if value.startswith(CONTROL_PREFIX):
-                raise CatalogueError(
-                    f"{path}: row {row}: {name} is {value!r}; expected another one: {CONTROL_PREFIX!r} begins those of control points"
-                )
-        first_row[image.image_id] = row
-        images.append(image)
-    if not images:
-        raise CatalogueError(f"{path}: holds no images; expected at least one row")
-    return tuple(images)
 
 
 __all__ = [

@@ -15,6 +15,7 @@ from submin.sensors import SENSORS, sensor_named
 from submin.sensors.footprint import footprints as seen_by
 from submin.storage.catalogue import Catalogue, read_footprint
 from submin.storage.catalogue_schema import ImageRecord
+from submin.storage.image_rows import BATCH_IMAGES
 from submin.tiling.footprints import EMPTY, Shapes, middles
 
 Array = NDArray[np.float64]
@@ -30,18 +31,26 @@ def image_footprints(catalogue: Catalogue, path: Path) -> Shapes:
     CatalogueError
         When a footprint is no polygon, or not where its camera looks.
     """
-    images = catalogue.images
+    ellipsoid = catalogue.metadata.ellipsoid
+    parts = [
+        _footprints(catalogue.images[start : start + BATCH_IMAGES], start + 1, ellipsoid, path)
+        for start in range(0, len(catalogue.images), BATCH_IMAGES)
+    ]
+    return np.concatenate([np.empty(0, dtype=np.object_), *parts])
+
+
+def _footprints(images: tuple[ImageRecord, ...], first_row: int, ellipsoid: Ellipsoid, path: Path) -> Shapes:
     known = np.array([bool(image.footprint) for image in images])
     shapes = np.full(len(images), EMPTY, dtype=np.object_)
     for k in np.flatnonzero(known):
-        name = f"{path}: row {k + 1}: geometry of image {images[k].image_id}"
+        name = f"{path}: row {first_row + k}: geometry of image {images[k].image_id}"
         shapes[k] = read_footprint(images[k].footprint, name)
         if shapes[k].is_empty:
             raise CatalogueError(f"{name} is empty; expected a polygon in longitude and latitude")
-    of_cameras = shapely.from_wkb(camera_footprints([images[k] for k in np.flatnonzero(~known)], catalogue.metadata.ellipsoid))
+    of_cameras = shapely.from_wkb(camera_footprints([images[k] for k in np.flatnonzero(~known)], ellipsoid))
     shapes[~known] = np.where(shapely.is_missing(of_cameras), EMPTY, of_cameras)
     if known.any():
-        _check(images, shapes, np.flatnonzero(known), catalogue.metadata.ellipsoid, path)
+        _check(images, shapes, np.flatnonzero(known), ellipsoid, path, first_row)
     return shapes
 
 
@@ -63,7 +72,9 @@ def _cameras(images: Sequence[ImageRecord]) -> tuple[Array, Array]:
     return np.stack([image.pack() for image in images]), np.array([(i.width, i.height) for i in images], dtype=np.float64)
 
 
-def _check(images: Sequence[ImageRecord], shapes: Shapes, rows: NDArray[np.int64], ellipsoid: Ellipsoid, path: Path) -> None:
+def _check(
+    images: tuple[ImageRecord, ...], shapes: Shapes, rows: NDArray[np.int64], ellipsoid: Ellipsoid, path: Path, first_row: int
+) -> None:
     """Refuse footprints that are off the globe, or nowhere near the place at which the camera looks with their axes swapped."""
     bounds = shapely.bounds(shapes[rows])
     off = ~((bounds[:, 1] >= -90.0) & (bounds[:, 3] <= 90.0) & (bounds[:, 0] >= -360.0) & (bounds[:, 2] <= 360.0))
@@ -75,7 +86,7 @@ def _check(images: Sequence[ImageRecord], shapes: Shapes, rows: NDArray[np.int64
     for at in np.flatnonzero(off | swapped)[:1]:
         (west, south, east, north), (longitude, latitude) = bounds[at], looks[at]
         raise InputError(
-            f"{path}: row {rows[at] + 1}: geometry of image {images[rows[at]].image_id} spans longitudes {west:g} to {east:g} and "
+            f"{path}: row {first_row + rows[at]}: geometry of image {images[rows[at]].image_id} spans longitudes {west:g} to {east:g} and "
             f"latitudes {south:g} to {north:g}, but its camera looks at longitude {longitude:g}, latitude {latitude:g}; "
             + ("its axes look swapped: expected longitude first, then latitude" if swapped[at] else "expected degrees on a globe")
         )

@@ -118,7 +118,7 @@ class TestRoundTrip:
     def test_all_that_is_written_is_read(self, folder: Path) -> None:
         catalogue = Catalogue.open(folder)
         assert catalogue.metadata == CatalogueMetadata("test", epoch="2020.0")
-        assert catalogue.images == IMAGES
+        assert tuple(catalogue.images) == IMAGES
         assert catalogue.block_ids == ("A", "B")
         assert catalogue.block_count == 2
         assert catalogue.a_priori("A") == APriori(bias_px=5.0)
@@ -137,7 +137,7 @@ class TestRoundTrip:
         expected, control = list(parquet.blocks()), parquet.points("control")
         as_csv(folder, compressed)
         catalogue = Catalogue.open(folder)
-        assert catalogue.images == IMAGES
+        assert tuple(catalogue.images) == IMAGES
         assert all(same_rays(a, b) for a, b in zip(catalogue.blocks(), expected, strict=True))
         assert [b.content_hash() for b in catalogue.blocks()] == [b.content_hash() for b in expected]
         found = catalogue.points("control")

@@ -88,7 +88,7 @@ def test_a_catalogue_of_observations_has_no_tables_of_images(tmp_path: Path) -> 
     path = write(tmp_path / "catalogue", clusters())
     assert sorted(file.name for file in path.iterdir()) == ["catalogue.json", "observations.parquet"]
     catalogue = Catalogue.open(path)
-    assert catalogue.images == () and list(catalogue.blocks()) == [] and catalogue.points("control") is None
+    assert len(catalogue.images) == 0 and list(catalogue.blocks()) == [] and catalogue.points("control") is None
     with pytest.raises(CatalogueError, match=r"no block 'b'; the catalogue has no images$"):
         catalogue.block("b")
 
