@@ -17,8 +17,12 @@ from orchestration.memory import give_back, keep_freed, own_peak_memory_mb, seld
 from orchestration.task_record import TaskRecord, added, recorded, taken_notes
 from submin.errors import ClusterError, InputError, KilledTaskError
 
-SHARED_VALUES_GO_WITH_TASKS = {"distributed.admin.large-graph-warning-threshold": "1GB"}
-"""Dask would warn at 10 MB and ask to scatter; `DaskExecutor.share` says why not."""
+SETTINGS = {
+    # Dask would warn at 10 MB and ask to scatter; `DaskExecutor.share` says why not
+    "distributed.admin.large-graph-warning-threshold": "1GB",
+    # for those who look for faults Dask keeps the last thousand messages to and from the scheduler: with them what tasks were given
+    "distributed.admin.low-level-log-length": 1,
+}
 STREAMED = 4
 """Results of a stream that a worker may be ahead of whoever takes them."""
 Advance = Callable[[], None]
@@ -333,8 +337,8 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
             client = Client(scheduler, timeout="10s")
         except (OSError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {scheduler!r} ({error}); start one with 'dask scheduler'") from None
-        with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), client, seldom_collected():
+        with dask.config.set(SETTINGS), client, seldom_collected():
             yield DaskExecutor(client)
         return
-    with dask.config.set(SHARED_VALUES_GO_WITH_TASKS), local_cluster(workers) as (client, deserted):
+    with dask.config.set(SETTINGS), local_cluster(workers) as (client, deserted):
         yield DaskExecutor(client, deserted)

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,23 @@ def test_an_error_in_a_stream_is_the_callers(cluster: LocalCluster) -> None:
         for executor in (SerialExecutor(), DaskExecutor(client)):
             with pytest.raises(InputError, match="value 0 is not wanted"):
                 list(executor.stream(fail, [(0,), (1,)], "fail"))
+
+
+def test_what_tasks_were_given_is_not_kept() -> None:
+    """Memory of the coordinator must not grow with the number of tasks: neither client nor scheduler may keep their messages."""
+    count, size = 40, 200_000
+    with executor_for(1) as executor:
+        executor.submit_all(len, [(bytes(size),)], "warm up", lambda: None)
+        tracemalloc.start()
+        try:
+            handles = executor.submit_all(len, [(bytes(size + k),) for k in range(count)], "length", lambda: None)
+            assert executor.results(handles) == [size + k for k in range(count)]
+            del handles
+            executor.give_back()
+            kept = tracemalloc.get_traced_memory()[0]
+        finally:
+            tracemalloc.stop()
+    assert kept < 0.25 * count * size
 
 
 def test_tasks_in_flight_are_bounded(cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch) -> None:
