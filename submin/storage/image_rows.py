@@ -1,4 +1,4 @@
-"""The images of a catalogue, of which only names and sizes are in memory: cameras and footprints wait in a file without a name."""
+"""The images of a catalogue. Of many only names and sizes are in memory: their cameras and footprints wait in a file without a name."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ IMAGE_COLUMNS = (
     text("licence", False, blank=True),
 )  # fmt: skip
 BATCH_IMAGES = 2048
+MOST_IN_MEMORY = 16 << 20
+"""Bytes of cameras and footprints that are kept in memory: of some six thousand images. Those of more wait in a file."""
 _LONG = ("camera", "geometry")
 """Columns that are not kept in memory: a camera is a text of some kilobytes."""
 _REPEATED = ("block_id", "pass_id", "platform", "sensor", "licence")
@@ -42,8 +44,8 @@ class ImageRows(Sequence[ImageRecord]):
     blocks : ids of all blocks, in the order in which the table names them
     """
 
-    def __init__(self, columns: pa.Table, ends: NDArray[np.int64], long_texts: int = -1) -> None:
-        """``long_texts``: a file (its descriptor) with camera and footprint of one image after the other; ``ends`` (2 m + 1,) of each."""
+    def __init__(self, columns: pa.Table, ends: NDArray[np.int64], long_texts: bytes | int = b"") -> None:
+        """``long_texts``: camera and footprint of one image after the other, or a file (its descriptor) of them; ``ends`` (2 m + 1,)."""
         self._columns, self._ends, self._long_texts = columns, ends, long_texts
         self.ids: pa.ChunkedArray = columns["image_id"]
         of_block = columns["block_id"].combine_chunks()
@@ -60,7 +62,8 @@ class ImageRows(Sequence[ImageRecord]):
             When the table, or one of its images, cannot be used: file, row, value, what was expected.
         """
         with ExitStack() as until_kept:
-            long_texts = until_kept.enter_context(tempfile.TemporaryFile(buffering=0))
+            file: io.FileIO | None = None
+            texts = bytearray()
             batches, ends = [], [np.zeros(1, dtype=np.int64)]
             first_row: dict[str, int] = {}
             for row, batch in table_batches(path, IMAGE_COLUMNS, BATCH_IMAGES):
@@ -69,7 +72,12 @@ class ImageRows(Sequence[ImageRecord]):
                 records = _records(batch, path, row)
                 _check(records, first_row, path, row)
                 pieces = [piece for image in records for piece in (image.camera.encode(), image.footprint)]
-                _write(long_texts, b"".join(pieces))
+                texts += b"".join(pieces)
+                if file is None and len(texts) > MOST_IN_MEMORY:
+                    file = until_kept.enter_context(tempfile.TemporaryFile(buffering=0))
+                if file is not None:
+                    _write(file, texts)
+                    texts.clear()
                 ends.append(ends[-1][-1] + np.cumsum([len(piece) for piece in pieces], dtype=np.int64))
                 batches.append(batch.drop_columns([name for name in _LONG if name in batch.schema.names]))
             if not first_row:
@@ -79,7 +87,7 @@ class ImageRows(Sequence[ImageRecord]):
                 if name in columns.schema.names:
                     at = columns.schema.get_field_index(name)
                     columns = columns.set_column(at, name, columns[name].combine_chunks().dictionary_encode())
-            images = cls(columns.combine_chunks(), np.concatenate(ends), long_texts.fileno())
+            images = cls(columns.combine_chunks(), np.concatenate(ends), bytes(texts) if file is None else file.fileno())
             weakref.finalize(images, until_kept.pop_all().close)
             return images
 
@@ -120,17 +128,18 @@ class ImageRows(Sequence[ImageRecord]):
 
     def _long(self, row: int) -> tuple[str, bytes]:
         start, middle, end = self._ends[2 * row : 2 * row + 3].tolist()
-        both = os.pread(self._long_texts, end - start, start)  # no seek: several threads may read
+        texts = self._long_texts  # of a file without seek: several threads may read
+        both = texts[start:end] if isinstance(texts, bytes) else os.pread(texts, end - start, start)
         if len(both) != end - start:
             raise CatalogueError(f"cameras were kept in a file in {tempfile.gettempdir()}, which is shorter now; give the command again")
         return both[: middle - start].decode(), both[middle - start :]
 
 
-def _write(long_texts: io.FileIO, piece: bytes) -> None:
-    left = memoryview(piece)
+def _write(file: io.FileIO, texts: bytearray) -> None:
+    left = memoryview(bytes(texts))
     try:
         while left:
-            left = left[long_texts.write(left) :]
+            left = left[file.write(left) :]
     except OSError as error:
         folder = tempfile.gettempdir()
         raise StoreError(f"{folder}: cameras cannot be kept there ({error.strerror}); make room, or set TMPDIR to another folder") from None

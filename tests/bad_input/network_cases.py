@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 from unittest import mock
 
@@ -13,6 +15,7 @@ import zarr
 from bad_input.disks import limited, read_only
 from bad_input.world import BOX, World, case, simply
 from orchestration.create import create
+from submin.storage import image_rows
 from submin.storage.catalogue import Catalogue
 
 # --- the command line -------------------------------------------------------------------------------------------------------------------
@@ -96,6 +99,17 @@ def _(w: World) -> list[Any]:
 def _(w: World) -> list[Any]:
     w.around = lambda: limited(100)
     return ["create", w.new, *BOX]
+
+
+@case("more cameras than stay in memory, and no room for the others")
+def _(w: World) -> list[Any]:
+    @contextmanager
+    def around() -> Iterator[None]:
+        with mock.patch.object(image_rows, "MOST_IN_MEMORY", 0), limited(1000):
+            yield
+
+    w.around = around
+    return w.run()
 
 
 # --- the area ---------------------------------------------------------------------------------------------------------------------------

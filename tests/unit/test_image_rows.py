@@ -34,10 +34,11 @@ def written(images: list[ImageRecord], folder: Path) -> Path:
     return folder / "images.parquet"
 
 
-@pytest.fixture(scope="module")
-def rows(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ImageRows]:
+@pytest.fixture(scope="module", params=[0, 2000, 1 << 20], ids=["in a file", "from some on in a file", "in memory"])
+def rows(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[ImageRows]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(image_rows, "BATCH_IMAGES", 7)
+        patch.setattr(image_rows, "MOST_IN_MEMORY", request.param)
         yield ImageRows.read(written(IMAGES, tmp_path_factory.mktemp("images") / "catalogue"))
 
 
@@ -63,7 +64,7 @@ def test_no_images() -> None:
 
 
 def test_cameras_are_not_in_memory(tmp_path: Path) -> None:
-    count, length = 4000, 5000
+    count, length = 5000, 5000  # more than stays in memory
     path = written([replace(IMAGES[0], image_id=f"i{k}", camera=f"{k}:".ljust(length)) for k in range(count)], tmp_path / "catalogue")
     gc.collect()
     before = pa.total_allocated_bytes()
@@ -84,6 +85,7 @@ def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def full(buffering: int) -> Any:
         return open("/dev/full", "wb", buffering=buffering)
 
+    monkeypatch.setattr(image_rows, "MOST_IN_MEMORY", 0)
     monkeypatch.setattr(image_rows.tempfile, "TemporaryFile", full)
     with pytest.raises(StoreError, match=r"cameras cannot be kept there \(No space left on device\); make room, or set TMPDIR"):
         ImageRows.read(path)
