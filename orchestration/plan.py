@@ -155,7 +155,7 @@ def plan(catalogue: Catalogue, place: str, *, batch_blocks: int = DEFAULT_BATCH_
             f"{catalogue.path}: has no images, of which a plan tells; 'submin run' takes its observations and control as they are"
         )
     check_frames(catalogue, snapshot)
-    catalogue.validate(measured=False)
+    catalogue.validate(measured=False, truth=False)
     refused, tally = list[Rejected](), Tally()
     arrivals = _arrivals(catalogue, snapshot, refused, tally, reporter)
     outside = arrivals.rays[snapshot.cover.outside_area(*arrivals.place.T)].sum() if len(arrivals.rays) else 0

@@ -173,19 +173,19 @@ def run(
 
 
 def _validation(catalogue: Catalogue, executor: Executor) -> Callable[[], object]:
-    """Look through the whole catalogue for structural errors; what is returned waits for it to be done, and raises what was found.
+    """Look for structural errors through all that a run reads of a catalogue; what is returned waits for that, and raises what was found.
 
     A worker that sees the same files does it, while the first blocks are read here.
     """
     if not executor.beside:
-        catalogue.validate()
+        catalogue.validate(truth=False)
         return lambda: None
     handle = executor.submit(_validate, (catalogue.path,), "validate")
     return lambda: executor.results([handle])
 
 
 def _validate(path: Path) -> None:
-    Catalogue.open(path).validate()
+    Catalogue.open(path).validate(truth=False)
 
 
 def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:

@@ -181,8 +181,10 @@ class Catalogue:
         path = table_path(self.path, OBSERVATIONS)
         return iter(()) if path is None else read_clusters(path, self.metadata.ellipsoid, frozenset(self.block_ids))
 
-    def validate(self, *, measured: bool = True) -> CatalogueSummary:
+    def validate(self, *, measured: bool = True, truth: bool = True) -> CatalogueSummary:
         """Scan the whole catalogue for structural errors; with ``measured`` that it holds no measurement is one.
+
+        Without ``truth`` the simulated truth, by far the largest of the tables of points, is left out: nothing but a comparison reads it.
 
         Raises
         ------
@@ -191,7 +193,8 @@ class Catalogue:
         """
         rays = self._validate_images(measured) if self.images else 0
         for kind in _COVARIANCE_OF:
-            self.points(kind)
+            if truth or kind != "truth":
+                self.points(kind)
         sizes = [len(cluster) for cluster in self.observations()]
         return CatalogueSummary(self.block_count, len(self.images), rays, len(sizes), sum(sizes))
 

@@ -171,10 +171,12 @@ def _covariances(table: pa.Table, path: Path, geodetic: Array, kind: Covariances
     values = np.linalg.eigvalsh(enu)
     floor = 1e-12 * np.abs(values[:, -1])  # round-off of the eigenvalues themselves
     bad = values[:, 0] <= 0.0 if kind == "definite" else values[:, 0] < -floor
-    refuse(
-        pa.array(bad), pa.array(enu.reshape(n, 9).tolist()), "covariance", path, 1,
-        "a positive definite matrix (m2)" if kind == "definite" else "a matrix without negative eigenvalues (m2)",
-    )  # fmt: skip
+    if bad.any():  # as lists all of them would be much larger than they are
+        first = int(np.argmax(bad))
+        refuse(
+            pa.array([True]), pa.array(enu[first].reshape(1, 9).tolist()), "covariance", path, 1 + first,
+            "a positive definite matrix (m2)" if kind == "definite" else "a matrix without negative eigenvalues (m2)",
+        )  # fmt: skip
     return enu, joint
 
 
