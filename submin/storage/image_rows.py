@@ -1,10 +1,7 @@
-"""The images of a catalogue. Of many only names and sizes are in memory: their cameras and footprints wait in a file without a name."""
+"""The images of a catalogue. Of many only names and sizes are in memory; their cameras and footprints wait in a file."""
 
 from __future__ import annotations
 
-import io
-import os
-import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -16,10 +13,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from submin.errors import CatalogueError, InputError, StoreError
+from submin.errors import CatalogueError, InputError
 from submin.formats.columns import Column, integer, refuse, table_batches, text
 from submin.sensors import SENSORS, SURVEYS
 from submin.storage.catalogue_schema import CONTROL_PREFIX, ImageRecord
+from submin.storage.spilled import Spilled
 
 IMAGE_COLUMNS = (
     text("image_id"), text("block_id"), text("pass_id"), text("platform", blank=True), text("sensor"), text("camera"),
@@ -27,8 +25,6 @@ IMAGE_COLUMNS = (
     text("licence", False, blank=True),
 )  # fmt: skip
 BATCH_IMAGES = 2048
-MOST_IN_MEMORY = 16 << 20
-"""Bytes of cameras and footprints that are kept in memory: of some six thousand images. Those of more wait in a file."""
 _LONG = ("camera", "geometry")
 """Columns that are not kept in memory: a camera is a text of some kilobytes."""
 _REPEATED = ("block_id", "pass_id", "platform", "sensor", "licence")
@@ -44,9 +40,10 @@ class ImageRows(Sequence[ImageRecord]):
     blocks : ids of all blocks, in the order in which the table names them
     """
 
-    def __init__(self, columns: pa.Table, ends: NDArray[np.int64], long_texts: bytes | int = b"") -> None:
-        """``long_texts``: camera and footprint of one image after the other, or a file (its descriptor) of them; ``ends`` (2 m + 1,)."""
+    def __init__(self, columns: pa.Table, ends: NDArray[np.int64], long_texts: Spilled) -> None:
+        """``long_texts``: camera and footprint of one image after the other; ``ends`` (2 m + 1,): where each begins and the last ends."""
         self._columns, self._ends, self._long_texts = columns, ends, long_texts
+        weakref.finalize(self, long_texts.close)
         self.ids: pa.ChunkedArray = columns["image_id"]
         of_block = columns["block_id"].combine_chunks()
         self.blocks = tuple(of_block.dictionary.to_pylist())
@@ -61,9 +58,9 @@ class ImageRows(Sequence[ImageRecord]):
         CatalogueError
             When the table, or one of its images, cannot be used: file, row, value, what was expected.
         """
-        with ExitStack() as until_kept:
-            file: io.FileIO | None = None
-            texts = bytearray()
+        with ExitStack() as on_error:
+            texts = Spilled()
+            on_error.callback(texts.close)
             batches, ends = [], [np.zeros(1, dtype=np.int64)]
             first_row: dict[str, int] = {}
             for row, batch in table_batches(path, IMAGE_COLUMNS, BATCH_IMAGES):
@@ -72,30 +69,20 @@ class ImageRows(Sequence[ImageRecord]):
                 records = _records(batch, path, row)
                 _check(records, first_row, path, row)
                 pieces = [piece for image in records for piece in (image.camera.encode(), image.footprint)]
-                texts += b"".join(pieces)
-                if file is None and len(texts) > MOST_IN_MEMORY:
-                    file = until_kept.enter_context(tempfile.TemporaryFile(buffering=0))
-                if file is not None:
-                    _write(file, texts)
-                    texts.clear()
+                texts.append(b"".join(pieces))
                 ends.append(ends[-1][-1] + np.cumsum([len(piece) for piece in pieces], dtype=np.int64))
                 batches.append(batch.drop_columns([name for name in _LONG if name in batch.schema.names]))
             if not first_row:
                 raise CatalogueError(f"{path}: holds no images; expected at least one row")
-            columns = pa.Table.from_batches(batches)
-            for name in _REPEATED:
-                if name in columns.schema.names:
-                    at = columns.schema.get_field_index(name)
-                    columns = columns.set_column(at, name, columns[name].combine_chunks().dictionary_encode())
-            images = cls(columns.combine_chunks(), np.concatenate(ends), bytes(texts) if file is None else file.fileno())
-            weakref.finalize(images, until_kept.pop_all().close)
+            images = cls(_compact(batches), np.concatenate(ends), texts)
+            on_error.pop_all()
             return images
 
     @classmethod
     def none(cls) -> ImageRows:
         """No images."""
         kinds = {c.name: pa.dictionary(pa.int32(), c.type) if c.name in _REPEATED else c.type for c in IMAGE_COLUMNS if c.name not in _LONG}
-        return cls(pa.schema(list(kinds.items())).empty_table(), np.zeros(1, dtype=np.int64))
+        return cls(pa.schema(list(kinds.items())).empty_table(), np.zeros(1, dtype=np.int64), Spilled())
 
     def __len__(self) -> int:
         return len(self._columns)
@@ -128,21 +115,17 @@ class ImageRows(Sequence[ImageRecord]):
 
     def _long(self, row: int) -> tuple[str, bytes]:
         start, middle, end = self._ends[2 * row : 2 * row + 3].tolist()
-        texts = self._long_texts  # of a file without seek: several threads may read
-        both = texts[start:end] if isinstance(texts, bytes) else os.pread(texts, end - start, start)
-        if len(both) != end - start:
-            raise CatalogueError(f"cameras were kept in a file in {tempfile.gettempdir()}, which is shorter now; give the command again")
+        both = self._long_texts.read(start, end)
         return both[: middle - start].decode(), both[middle - start :]
 
 
-def _write(file: io.FileIO, texts: bytearray) -> None:
-    left = memoryview(bytes(texts))
-    try:
-        while left:
-            left = left[file.write(left) :]
-    except OSError as error:
-        folder = tempfile.gettempdir()
-        raise StoreError(f"{folder}: cameras cannot be kept there ({error.strerror}); make room, or set TMPDIR to another folder") from None
+def _compact(batches: Sequence[pa.RecordBatch]) -> pa.Table:
+    """One table, in which texts that come again and again are numbers."""
+    table = pa.Table.from_batches(batches)
+    for name in _REPEATED:
+        if name in table.schema.names:
+            table = table.set_column(table.schema.get_field_index(name), name, table[name].combine_chunks().dictionary_encode())
+    return table.combine_chunks()
 
 
 def _records(batch: pa.RecordBatch, path: Path, first_row: int) -> list[ImageRecord]:

@@ -15,7 +15,7 @@ import zarr
 from bad_input.disks import limited, read_only
 from bad_input.world import BOX, World, case, simply
 from orchestration.create import create
-from submin.storage import image_rows
+from submin.storage import spilled
 from submin.storage.catalogue import Catalogue
 
 # --- the command line -------------------------------------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ def _(w: World) -> list[Any]:
 def _(w: World) -> list[Any]:
     @contextmanager
     def around() -> Iterator[None]:
-        with mock.patch.object(image_rows, "MOST_IN_MEMORY", 0), limited(1000):
+        with mock.patch.object(spilled, "MOST_IN_MEMORY", 0), limited(1000):
             yield
 
     w.around = around

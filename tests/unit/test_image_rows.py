@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 from submin.errors import StoreError
-from submin.storage import image_rows
+from submin.storage import image_rows, spilled
 from submin.storage.catalogue_schema import CatalogueMetadata, ImageRecord
 from submin.storage.catalogue_writer import CatalogueWriter
 from submin.storage.image_rows import ImageRows
@@ -38,7 +38,7 @@ def written(images: list[ImageRecord], folder: Path) -> Path:
 def rows(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[ImageRows]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(image_rows, "BATCH_IMAGES", 7)
-        patch.setattr(image_rows, "MOST_IN_MEMORY", request.param)
+        patch.setattr(spilled, "MOST_IN_MEMORY", request.param)
         yield ImageRows.read(written(IMAGES, tmp_path_factory.mktemp("images") / "catalogue"))
 
 
@@ -85,7 +85,7 @@ def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def full(buffering: int) -> Any:
         return open("/dev/full", "wb", buffering=buffering)
 
-    monkeypatch.setattr(image_rows, "MOST_IN_MEMORY", 0)
-    monkeypatch.setattr(image_rows.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(spilled, "MOST_IN_MEMORY", 0)
+    monkeypatch.setattr(spilled.tempfile, "TemporaryFile", full)
     with pytest.raises(StoreError, match=r"cameras cannot be kept there \(No space left on device\); make room, or set TMPDIR"):
         ImageRows.read(path)
