@@ -29,9 +29,22 @@ class Stopped(BaseException):
         return 128 + self.number
 
 
+_ASKED: list[int] = []
+"""The signal that has asked to stop, while `signals_stop` is around."""
+
+
+def stop_if_asked() -> None:
+    """Raise `Stopped` once more where a signal has come and the program goes on.
+
+    What is raised inside a finaliser, as while garbage is collected, is printed by Python and lost.
+    """
+    if _ASKED:
+        raise Stopped(_ASKED[0])
+
+
 @contextmanager
 def signals_stop() -> Iterator[None]:
-    """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is.
+    """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is; `stop_if_asked` raises it again.
 
     Later ones leave it to clean up in peace, for so long as that may take; then they end the process as it is, which loses nothing
     that is committed.
@@ -42,6 +55,7 @@ def signals_stop() -> Iterator[None]:
         nonlocal first
         if first is None:
             first = time.monotonic()
+            _ASKED.append(number)
             raise Stopped(number)
         if time.monotonic() - first > PATIENCE_SECONDS:
             os._exit(Stopped(number).exit_code)
@@ -53,6 +67,7 @@ def signals_stop() -> Iterator[None]:
     finally:
         for each, handler in before.items():
             signal.signal(each, handler)
+        _ASKED.clear()
 
 
 @contextmanager

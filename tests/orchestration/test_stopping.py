@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestration.stopping import Stopped, resumable, signals_stop
+from orchestration.executors import executor_for
+from orchestration.stopping import Stopped, resumable, signals_stop, stop_if_asked
 from submin.errors import ClusterError, InputError
 
 SWALLOWS = """
@@ -41,6 +42,30 @@ def test_the_first_signal_raises(number: signal.Signals, code: int) -> None:
     assert cleaned
     assert stopped.value.exit_code == code
     assert signal.getsignal(number) is before
+
+
+class Finalised:
+    """A signal comes while it is finalised."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_signal_that_a_finaliser_swallows_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As between two batches, when garbage is collected: the run would go on to its end."""
+    swallowed: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda of: swallowed.append(type(of.exc_value).__name__))
+    with executor_for(1) as executor:
+        with pytest.raises(Stopped), signals_stop():
+            del (going := [Finalised()])[0]
+            assert swallowed == ["Stopped"] and not going
+            executor.give_back()
+        executor.give_back()  # nobody asks any more
+    with pytest.raises(Stopped) as stopped, signals_stop():
+        del (going := [Finalised()])[0]
+        stop_if_asked()
+    assert stopped.value.exit_code == 143 and not going
+    stop_if_asked()
 
 
 def test_a_program_that_swallows_the_first_signal_ends_with_a_later_one() -> None:
