@@ -16,15 +16,19 @@ import pyarrow.parquet as pq
 def held_back(catalogue: Path, blocks: Sequence[int], rest: Path, each: Path) -> list[Path]:
     """Write of a catalogue in Parquet the catalogue ``rest``, and one for each block that is held back.
 
-    Args:
-        catalogue: the catalogue, whose blocks are told by their ``block_id``.
-        blocks: places of the blocks to hold back, in the order of the catalogue.
-        rest: new folder for the catalogue of all other blocks.
-        each: new folder, in which every block gets a catalogue named by its id.
+    Measurements go through in pieces: memory does not grow with the catalogue.
 
-    Returns:
-        The folders of the single blocks, in the order of ``blocks``. Measurements go through in pieces: memory does not grow with the
-        catalogue.
+    Parameters
+    ----------
+    catalogue : the catalogue, whose blocks are told by their ``block_id``
+    blocks : places of the blocks to hold back, in the order of the catalogue
+    rest : new folder for the catalogue of all other blocks
+    each : new folder, in which every block gets a catalogue named by its id
+
+    Returns
+    -------
+    list
+        The folders of the single blocks, in the order of ``blocks``.
     """
     images = pq.read_table(catalogue / "images.parquet")
     every = images["block_id"].unique().to_pylist()

@@ -143,8 +143,8 @@ def _records(batch: pa.RecordBatch, path: Path, first_row: int) -> list[ImageRec
 
 def _check(records: Sequence[ImageRecord], first_row: dict[str, int], path: Path, start: int) -> None:
     """Refuse images of sensors that are none of images, and those that are there twice or take a name of control."""
+    of_images = [name for name, sensor in SENSORS.items() if sensor.parameters and name not in SURVEYS]
     for row, image in enumerate(records, start=start):
-        of_images = [name for name, sensor in SENSORS.items() if sensor.parameters and name not in SURVEYS]
         if image.sensor in SENSORS and image.sensor not in of_images:  # views that the program makes itself
             raise CatalogueError(
                 f"{path}: row {row}: sensor is {image.sensor!r}, which is none of images; expected one of {', '.join(of_images)}"
