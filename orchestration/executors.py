@@ -14,7 +14,6 @@ from threadpoolctl import ThreadpoolController
 
 from orchestration.local_cluster import Deserted, local_cluster
 from orchestration.memory import give_back, keep_freed, own_peak_memory_mb, seldom_collected
-from orchestration.stopping import stop_if_asked
 from orchestration.task_record import TaskRecord, added, recorded, taken_notes
 from submin.errors import ClusterError, InputError, KilledTaskError
 
@@ -278,14 +277,13 @@ class DaskExecutor:
 
     @contextmanager
     def _losses_said(self) -> Iterator[None]:
-        """What Dask raises when processes are lost, as one error that says it. Errors of tasks pass. A request to stop is not lost."""
+        """What Dask raises when processes are lost, as one error that says it. Errors of tasks pass."""
         from concurrent.futures import CancelledError
 
         from distributed import KilledWorker
         from distributed.client import ClosedClientError
         from distributed.comm.core import CommClosedError
 
-        stop_if_asked()
         try:
             yield
         except KilledWorker as error:

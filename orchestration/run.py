@@ -17,7 +17,6 @@ from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from orchestration.read_ahead import batches_ahead
-from orchestration.stopping import stop_if_asked
 from orchestration.task_record import TaskRecord
 from orchestration.tasks import FlaggedImage
 from submin.adjustment.surveyed_points import ContradictedPoint
@@ -232,7 +231,6 @@ def fuse_blocks(
         for number, batch in enumerate(_once(validated, batches_ahead(_with_images(new), max(batch_blocks, 1)))):
             if number:
                 executor.give_back()
-                stop_if_asked()
             good = [come.block for come in batch if come.reason is None]
             refused = [Rejected.of(come.block, come.reason) for come in batch if come.reason is not None]
             images = {come.block.block_id: come.images for come in batch}

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 PATIENCE_SECONDS = 10.0
+SOON_SECONDS = 0.05
 SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 
 
@@ -29,45 +32,46 @@ class Stopped(BaseException):
         return 128 + self.number
 
 
-_ASKED: list[int] = []
-"""The signal that has asked to stop, while `signals_stop` is around."""
-
-
-def stop_if_asked() -> None:
-    """Raise `Stopped` once more where a signal has come and the program goes on.
-
-    What is raised inside a finaliser, as while garbage is collected, is printed by Python and lost.
-    """
-    if _ASKED:
-        raise Stopped(_ASKED[0])
-
-
 @contextmanager
 def signals_stop() -> Iterator[None]:
-    """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is; `stop_if_asked` raises it again.
+    """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is.
 
-    Later ones leave it to clean up in peace, for so long as that may take; then they end the process as it is, which loses nothing
-    that is committed.
+    Where that is a finaliser or a callback of the garbage collector, Python would print what is raised and go on: then the signal is
+    sent once more, soon after. Later signals leave the program to clean up in peace, for so long as that may take; then they end the
+    process as it is, which loses nothing that is committed.
     """
     first: float | None = None
+    again: list[threading.Timer] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal first
         if first is None:
             first = time.monotonic()
-            _ASKED.append(number)
             raise Stopped(number)
         if time.monotonic() - first > PATIENCE_SECONDS:
             os._exit(Stopped(number).exit_code)
 
+    def swallowed(what: sys.UnraisableHookArgs) -> None:
+        nonlocal first
+        if not isinstance(what.exc_value, Stopped):
+            said(what)
+            return
+        first = None
+        again.append(threading.Timer(SOON_SECONDS, signal.pthread_kill, (threading.main_thread().ident, what.exc_value.number)))
+        again[-1].start()
+
     # a signal that is ignored already (a job in the background) stays ignored
     before = {each: signal.signal(each, stop) for each in SIGNALS if signal.getsignal(each) is not signal.SIG_IGN}
+    said, sys.unraisablehook = sys.unraisablehook, swallowed
     try:
         yield
     finally:
+        for timer in again:
+            timer.cancel()
+            timer.join()
+        sys.unraisablehook = said
         for each, handler in before.items():
             signal.signal(each, handler)
-        _ASKED.clear()
 
 
 @contextmanager
