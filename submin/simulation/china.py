@@ -23,8 +23,9 @@ from submin.adjustment.priors import APriori
 from submin.errors import InputError
 from submin.geodesy import geocentric_to_geodetic, local_axes
 from submin.simulation.campaign import MEAN_RADIUS_KM, Campaign, CampaignDesign, Scene
+from submin.simulation.hilbert import along_hilbert
 from submin.simulation.linear_array import ZY3_VIEWS
-from submin.simulation.point_grid import KM_OF_DEGREE, PointGrid
+from submin.simulation.point_grid import PointGrid
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -64,7 +65,6 @@ EQUATOR = round(0.5 * np.pi * MEAN_RADIUS_KM / STEP_KM)
 """Number along its track of the scene at the equator; a track is half a circle."""
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 _SAMPLES = 7
-_ORDER_KM = 200.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def china_layout(outline: BaseGeometry, triplets: int = TRIPLETS) -> Layout:
     layout, centre = Layout(track, number, run, inside).rows(most), centre[most]
     middle = np.argsort(_distance(centre, CENTRE), kind="stable")[:triplets]
     layout, centre = layout.rows(middle), centre[middle]
-    return layout.rows(_snake(centre, layout))
+    return layout.rows(_neighbours_together(centre, layout))
 
 
 def china(outline: BaseGeometry, scale: float = 1.0, seed: int = 0, error: str = "mixed") -> Campaign:
@@ -239,8 +239,7 @@ def _distance(lonlat: Array, centre: tuple[float, float]) -> Array:
     return np.asarray(-(up[:-1] @ up[-1]))
 
 
-def _snake(centre: Array, layout: Layout) -> Index:
-    """Order in which neighbours come together: squares of 200 km row by row, to and fro."""
-    row = np.floor(centre[:, 1] * KM_OF_DEGREE / _ORDER_KM)
-    column = np.floor(centre[:, 0] * KM_OF_DEGREE * np.cos(np.radians(CENTRE[1])) / _ORDER_KM)
-    return np.lexsort((layout.number, layout.track, np.where(row % 2, -column, column), row))
+def _neighbours_together(centre: Array, layout: Layout) -> Index:
+    """Order along Hilbert's curve: a batch is a compact piece of land, so that few tiles are of two batches."""
+    east = centre[:, 0] * np.cos(np.radians(CENTRE[1]))
+    return np.lexsort((layout.number, layout.track, along_hilbert(np.stack([east, centre[:, 1]], axis=1))))
