@@ -24,7 +24,7 @@ from submin.network.observations import Cluster
 from submin.network.pending import DenseNetwork, check_regular
 from submin.storage.arrays import append_table, group_of, set_rows
 from submin.storage.catalogue import Catalogue
-from submin.storage.catalogue_schema import Block, ImageRecord, PointTable
+from submin.storage.catalogue_schema import Block, ImageRecord, PointTable, defects
 from submin.storage.dense_store import Member, append_members, read_members, read_points, read_state, write_state
 from submin.storage.ledger import Entry, Ledger, append_entries
 from submin.storage.network_store import Snapshot, begin_change, commit
@@ -134,7 +134,7 @@ class Working:
             With the reason for which it cannot come in.
         """
         if isinstance(arrival, Block):
-            reason = self.ledger.refusal(arrival)
+            reason = self.ledger.refusal(arrival) or defects(arrival)
             if reason is not None:
                 raise InputError(reason)
             member = free_points(arrival, self.ellipsoid)

@@ -25,6 +25,7 @@ SETTINGS = {
 }
 STREAMED = 4
 """Results of a stream that a worker may be ahead of whoever takes them."""
+SENT_AGAIN = 3
 Advance = Callable[[], None]
 T = TypeVar("T")
 
@@ -53,7 +54,10 @@ class Executor(Protocol):
         ...
 
     def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
-        """The values of a function for tuples of arguments, in their order, a bounded number of them at a time: none is kept."""
+        """The values of a function for tuples of arguments, in their order, a bounded number of them at a time: none is kept.
+
+        A task whose workers were killed again and again is sent `SENT_AGAIN` more times: it may have waited on the worker of another one.
+        """
         ...
 
     def attempt_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
@@ -235,15 +239,25 @@ class DaskExecutor:
 
     def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
         """See `Executor.stream`."""
-        waiting: deque[Any] = deque()
+        waiting: deque[tuple[Any, tuple[Any, ...]]] = deque()
         with self._losses_said():
             for args in arguments:
-                waiting.append(self._start(function, args, name))
+                waiting.append((self._start(function, args, name), args))
                 self._check_scheduler()
                 if len(waiting) == STREAMED * self.workers:
-                    yield waiting.popleft().result()
+                    yield self._streamed(function, *waiting.popleft(), name)
             while waiting:
-                yield waiting.popleft().result()
+                yield self._streamed(function, *waiting.popleft(), name)
+
+    def _streamed(self, function: Callable[..., Any], handle: Any, arguments: tuple[Any, ...], name: str) -> Any:
+        from distributed import KilledWorker
+
+        for _ in range(SENT_AGAIN):
+            try:
+                return handle.result()
+            except KilledWorker:
+                handle = self._start(function, arguments, name)
+        return handle.result()
 
     def _attempt(self, handle: Any) -> Any:
         try:

@@ -27,7 +27,7 @@ from submin.network.network_image import image_set
 from submin.sensors import width_of
 from submin.storage.block_images import network_images
 from submin.storage.catalogue import Catalogue
-from submin.storage.catalogue_schema import Block
+from submin.storage.catalogue_schema import Block, defects
 from submin.storage.control_blocks import control_blocks
 from submin.storage.dense_reader import refuse_dense
 from submin.storage.image_footprints import image_footprints
@@ -198,7 +198,7 @@ def _arrivals(catalogue: Catalogue, snapshot: Snapshot, refused: list[Rejected],
             continue
         at, count, reason = np.empty((0, 2)), NONE, None
         if len(each):  # a block without rays is not yet measured
-            reason = ledger.refusal(each)
+            reason = ledger.refusal(each) or defects(each)
             if reason is None:
                 at, count = _points(each, ellipsoid)
                 reason = wholly_outside(at, cover) if cover.outside(*at.T).all() else None

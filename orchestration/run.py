@@ -17,13 +17,13 @@ from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from orchestration.read_ahead import batches_ahead
+from orchestration.reading import ReadBlock, looked_at, read_catalogue
 from orchestration.task_record import TaskRecord
 from orchestration.tasks import FlaggedImage
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import InputError
 from submin.network.innovation import REJECTED
 from submin.network.network_image import NetworkImage
-from submin.storage.block_images import images_of_blocks
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, observed_positions, points_of
@@ -34,8 +34,6 @@ from submin.storage.writer_lock import writing
 T = TypeVar("T")
 
 DEFAULT_BATCH_BLOCKS = 2000
-BLOCKS_TOGETHER = 64
-"""Blocks whose images are worked out together while they are read."""
 
 
 @dataclass(frozen=True)
@@ -158,11 +156,8 @@ def run(
     observed = observation_blocks(catalogue)
     clusters = sum(1 for _ in catalogue.observations())
     reporter.begin(catalogue.block_count + (0 if control is None else len(control)) + clusters)
-    every = chain(
-        catalogue.blocks(),
-        () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control"),
-        observed,
-    )
+    surveyed = () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
+    every = chain(read_catalogue(catalogue, executor), looked_at(chain(surveyed, observed)))
     check = catalogue.points("check")
     tally = fuse_blocks(
         every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids, validated
@@ -207,7 +202,7 @@ def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:
 
 
 def fuse_blocks(
-    blocks: Iterable[Block], place: str, executor: Executor, batch_blocks: int, reporter: Reporter, innovation: float = REJECTED,
+    blocks: Iterable[ReadBlock], place: str, executor: Executor, batch_blocks: int, reporter: Reporter, innovation: float = REJECTED,
     check_points: NDArray[np.str_] | None = None, validated: Callable[[], object] = lambda: None,
 ) -> Tally:  # fmt: skip
     """Fuse those of some blocks that the network does not have yet, so many to a commit; it remembers ``check_points`` with them.
@@ -228,7 +223,7 @@ def fuse_blocks(
         tally = Tally(before.number, {row for _, row in before.flags()})
         new = _new_blocks(blocks, Ledger.of(before), tally, reporter)
         del before
-        for number, batch in enumerate(_once(validated, batches_ahead(_with_images(new), max(batch_blocks, 1)))):
+        for number, batch in enumerate(_once(validated, batches_ahead(new, max(batch_blocks, 1)))):
             if number:
                 executor.give_back()
             good = [come.block for come in batch if come.reason is None]
@@ -265,19 +260,6 @@ def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -
     )  # fmt: skip
 
 
-def _new_blocks(blocks: Iterable[Block], ledger: Ledger, tally: Tally, reporter: Reporter) -> Iterator[tuple[Block, str | None]]:
-    """Blocks that the network does not have, each with the reason for which it cannot come in, if any."""
-    for block in blocks:
-        if ledger.holds(block):
-            tally.skipped += block.kind == "images"
-            reporter.fused(1)
-            continue
-        reason = ledger.refusal(block)
-        if reason is None:
-            ledger.enter(block)
-        yield block, reason
-
-
 @dataclass(frozen=True)
 class _Incoming:
     """A block that the network does not have: why it cannot come in, if so, and its images as the network will have them, if not."""
@@ -287,12 +269,17 @@ class _Incoming:
     images: tuple[NetworkImage, ...]
 
 
-def _with_images(new: Iterable[tuple[Block, str | None]]) -> Iterator[_Incoming]:
-    """New blocks with their images, which are worked out for some blocks together."""
-    left = iter(new)
-    while group := list(islice(left, BLOCKS_TOGETHER)):
-        images = iter(images_of_blocks([block for block, reason in group if reason is None]))
-        yield from (_Incoming(block, reason, next(images) if reason is None else ()) for block, reason in group)
+def _new_blocks(blocks: Iterable[ReadBlock], ledger: Ledger, tally: Tally, reporter: Reporter) -> Iterator[_Incoming]:
+    """Blocks that the network does not have."""
+    for read in blocks:
+        if ledger.holds(read.block):
+            tally.skipped += read.block.kind == "images"
+            reporter.fused(1)
+            continue
+        reason = ledger.refusal(read.block) or read.defect
+        if reason is None:
+            ledger.enter(read.block)
+        yield _Incoming(read.block, reason, read.images)
 
 
 def check_frames(catalogue: Catalogue, snapshot: Snapshot) -> None:

@@ -25,16 +25,14 @@ from submin.errors import CatalogueError, InputError
 from submin.formats.columns import (
     empty_table,
     number,
-    number_values,
     required_path,
     table_path,
     table_runs,
     text,
-    text_values,
 )
 from submin.network.observations import Cluster
+from submin.storage.block_rows import BlockRows
 from submin.storage.catalogue_schema import (
-    DEFAULT_SIGMA_PX,
     POINT_KINDS,
     Block,
     CatalogueMetadata,
@@ -126,7 +124,11 @@ class Catalogue:
         return self.priors.get(block_id, self.default_prior)
 
     def blocks(self, skip: Collection[str] = frozenset()) -> Iterator[Block]:
-        """Every block but those in ``skip``, once: in the order of the measurements, and last the blocks without any.
+        """Every block but those in ``skip``, as `block_rows` has them."""
+        return (rows.block() for rows in self.block_rows(skip))
+
+    def block_rows(self, skip: Collection[str] = frozenset()) -> Iterator[BlockRows]:
+        """The rows of every block but those in ``skip``, once: in the order of the measurements, and last the blocks without any.
 
         Memory is bounded by one block and one batch of rows.
 
@@ -142,10 +144,10 @@ class Catalogue:
         for block_id, row, table in _runs(path):
             measured.add(block_id)
             if block_id not in skip:
-                yield self._block(block_id, row, table, path)
+                yield self._rows(block_id, row, table, path)
         for block_id in self.block_ids:
             if block_id not in measured and block_id not in skip:
-                yield self._block(block_id, 1, empty_table(MEASUREMENT_COLUMNS), path)
+                yield self._rows(block_id, 1, empty_table(MEASUREMENT_COLUMNS), path)
 
     def block(self, block_id: str) -> Block:
         """One block; raises `CatalogueError` for an unknown one."""
@@ -158,8 +160,8 @@ class Catalogue:
         path = required_path(self.path, "measurements")
         for found, row, table in _runs(path):
             if found == block_id:
-                return self._block(block_id, row, table, path)
-        return self._block(block_id, 1, empty_table(MEASUREMENT_COLUMNS), path)
+                return self._rows(block_id, row, table, path).block()
+        return self._rows(block_id, 1, empty_table(MEASUREMENT_COLUMNS), path).block()
 
     def points(self, kind: Literal["control", "check", "truth"]) -> PointTable | None:
         """Control points, check points or simulated truth; None when the catalogue has no such table."""
@@ -227,21 +229,10 @@ class Catalogue:
             raise CatalogueError(f"{path}: row {row + k}: image_id is {image_id!r}, {found}; expected an image of block {block_id!r}")
         return np.asarray(index.to_numpy(), dtype=np.int32)
 
-    def _block(self, block_id: str, row: int, table: pa.Table, path: Path) -> Block:
+    def _rows(self, block_id: str, row: int, table: pa.Table, path: Path) -> BlockRows:
         image = self._image_index(block_id, row, table, path)
-        return Block(
-            block_id,
-            self.images.take(self._rows_of[block_id]),
-            self.a_priori(block_id),
-            text_values(table, "point_id"),
-            image,
-            number_values(table, "sample"),
-            number_values(table, "line"),
-            number_values(table, "sigma_sample", DEFAULT_SIGMA_PX),
-            number_values(table, "sigma_line", DEFAULT_SIGMA_PX),
-            source=path.name,
-            first_row=row,
-        )
+        images = self.images.take(self._rows_of[block_id])
+        return BlockRows(block_id, images, self.a_priori(block_id), image, table.drop_columns(["block_id", "image_id"]), path.name, row)
 
 
 def _needs_images(folder: Path) -> bool:

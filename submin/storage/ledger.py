@@ -10,7 +10,7 @@ import numpy as np
 import zarr
 
 from submin.storage.arrays import append_table
-from submin.storage.catalogue_schema import Block, defects
+from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import point_of_view, points_of
 from submin.storage.network_store import Snapshot
 
@@ -100,7 +100,7 @@ class Ledger:
         return block.block_id in self._content and self._content[block.block_id] == block.content_hash()
 
     def refusal(self, block: Block) -> str | None:
-        """Why a block that is not the same as before cannot come in, or None."""
+        """Why a block that is not the same as before cannot come in, whatever its measurements are, or None."""
         if block.block_id in self._content:
             if block.kind == "control":
                 what = f"control point {block.point_ids[0]}" if block.joint is None else f"set of {len(points_of(block))} control points"
@@ -115,7 +115,7 @@ class Ledger:
                 )
             if image.image_id in self.block_of_image:
                 return f"image {image.image_id} already came in block {self.block_of_image[image.image_id]}; an image counts once"
-        return defects(block)
+        return None
 
     def enter(self, block: Block) -> None:
         """A block is on its way in: nothing later in the run may bring it or its images again."""

@@ -17,7 +17,7 @@ from distributed import Client, LocalCluster
 from networks import SMALL, area_of, fuse
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from orchestration import local_cluster
+from orchestration import executors, local_cluster
 from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, ThreadExecutor, executor_for
 from orchestration.read_ahead import batches_ahead
 from submin.errors import ClusterError, InputError, KilledTaskError
@@ -48,6 +48,15 @@ def kill_the_worker(value: int) -> int:
 
 def kill_for_three(value: int) -> int:
     return kill_the_worker(value) if value == 3 else double(value)
+
+
+def kill_three_times(folder: Path, value: int) -> int:
+    """Value 2 kills the first three workers that it comes to."""
+    killed = len(list(folder.iterdir()))
+    if value == 2 and killed < 3:
+        (folder / str(killed)).touch()
+        kill_the_worker(value)
+    return double(value)
 
 
 @pytest.fixture(scope="module")
@@ -234,6 +243,17 @@ def test_past_a_task_that_kills_its_workers() -> None:
         assert len(steps) == 5
         with pytest.raises(InputError, match="value 0 is not wanted"):
             executor.attempt_all(fail, [(0,)], "fail", lambda: None)
+
+
+def test_a_stream_goes_on_past_killed_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its tasks may have waited on the worker of another one that kills; one that kills for ever is named."""
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), executor_for(1) as executor:
+        values = executor.stream(kill_three_times, ((tmp_path, k) for k in range(6)), "stream")
+        assert list(values) == [0, 2, 4, 6, 8, 10]
+        assert len(list(tmp_path.iterdir())) == 3
+        monkeypatch.setattr(executors, "SENT_AGAIN", 0)
+        with pytest.raises(KilledTaskError, match=r"2 workers that ran the same task \(stream\)"):
+            list(executor.stream(kill_the_worker, [(1,)], "stream"))
 
 
 def test_an_input_or_output_error_of_a_task_is_no_lost_scheduler(cluster: LocalCluster) -> None:
