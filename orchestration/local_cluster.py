@@ -31,6 +31,9 @@ SETTINGS = {
     "distributed.deploy.lost-worker-timeout": "1 day",
 }
 
+LISTENING = {"protocol": ["tcp://", "inproc://"], "host": ["127.0.0.1", ""]}
+"""Where the scheduler listens: for workers at a port of this machine, for the client, which is in its own process, without a copy."""
+
 
 class Deserted(threading.Event):
     """Set once there has been no worker for so long that none is waited for any more."""
@@ -48,9 +51,11 @@ def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
     with dask.config.set(SETTINGS):
         with _children_deaf_to_ctrl_c():
             cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL,
+                scheduler_kwargs=LISTENING,
             )  # fmt: skip
-        with cluster, Client(cluster) as client, _watched(cluster, client) as deserted, seldom_collected():
+        here = cluster.scheduler.listeners[-1].contact_address
+        with cluster, Client(here) as client, _watched(cluster, client) as deserted, seldom_collected():
             client.register_plugin(Prepared())
             yield client, deserted
 
