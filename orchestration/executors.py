@@ -144,9 +144,8 @@ class ThreadExecutor(SerialExecutor):
         self._libraries = ThreadpoolController()
 
     def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
-        """See `Executor.submit_all`. Where tasks run side by side BLAS takes one thread in each: with several they wait for one another."""
-        limit = 1 if len(arguments) > 1 else None
-        with self._libraries.limit(limits=limit, user_api="blas"), ThreadPoolExecutor(self._threads, thread_name_prefix=name) as pool:
+        """See `Executor.submit_all`. BLAS takes one thread in each task: with several they wait for one another, and for all else."""
+        with self._libraries.limit(limits=1, user_api="blas"), ThreadPoolExecutor(self._threads, thread_name_prefix=name) as pool:
             handles = [pool.submit(recorded, name, function, *args) for args in arguments]
             try:
                 done = []

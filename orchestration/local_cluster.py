@@ -54,8 +54,8 @@ def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL,
                 scheduler_kwargs=LISTENING,
             )  # fmt: skip
-        here = cluster.scheduler.listeners[-1].contact_address
-        with cluster, Client(here) as client, _watched(cluster, client) as deserted, seldom_collected():
+        scheduler: Any = cluster.scheduler
+        with cluster, Client(scheduler.listeners[-1].contact_address) as client, _watched(cluster, client) as deserted, seldom_collected():
             client.register_plugin(Prepared())
             yield client, deserted
 
