@@ -20,7 +20,7 @@ Rows = list[dict[str, Any]]
 PARTS = (0.1, 1.0 / 3.0, 1.0, 3.0)
 SPEED_UP, TIME_SPREAD, MEMORY_SPREAD = 1.8, 1.15, 1.20
 BATCH_BLOCKS = 220
-"""Blocks of a commit: four batches in the smallest part. Tiles on the rim of a batch are judged again, and a part of one or two has less rim."""
+"""Blocks of a commit: four batches in the smallest part. Tiles on the rim of a batch are judged again; one or two batches have less rim."""
 ALONE = PARTS[1]
 """The part that one worker does too: minutes of work, so that what it takes to start does not count."""
 
