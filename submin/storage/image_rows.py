@@ -59,7 +59,7 @@ class ImageRows(Sequence[ImageRecord]):
             When the table, or one of its images, cannot be used: file, row, value, what was expected.
         """
         with ExitStack() as on_error:
-            texts = Spilled()
+            texts = Spilled("cameras")
             on_error.callback(texts.close)
             batches, ends = [], [np.zeros(1, dtype=np.int64)]
             first_row: dict[str, int] = {}
@@ -82,7 +82,7 @@ class ImageRows(Sequence[ImageRecord]):
     def none(cls) -> ImageRows:
         """No images."""
         kinds = {c.name: pa.dictionary(pa.int32(), c.type) if c.name in _REPEATED else c.type for c in IMAGE_COLUMNS if c.name not in _LONG}
-        return cls(pa.schema(list(kinds.items())).empty_table(), np.zeros(1, dtype=np.int64), Spilled())
+        return cls(pa.schema(list(kinds.items())).empty_table(), np.zeros(1, dtype=np.int64), Spilled("cameras"))
 
     def __len__(self) -> int:
         return len(self._columns)

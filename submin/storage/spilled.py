@@ -21,7 +21,9 @@ class Spilled:
         By `append`, where there is no room for the file; by `read`, when somebody has cut it short.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, what: str) -> None:
+        """``what`` the bytes are, for messages."""
+        self._what = what
         self._held = bytearray()
         self._file: io.FileIO | None = None
 
@@ -39,7 +41,7 @@ class Spilled:
         except OSError as error:
             folder = tempfile.gettempdir()
             raise StoreError(
-                f"{folder}: cameras cannot be kept there ({error.strerror}); make room, or set TMPDIR to another folder"
+                f"{folder}: {self._what} cannot be kept there ({error.strerror}); make room, or set TMPDIR to another folder"
             ) from None
         self._held.clear()
 
@@ -49,7 +51,7 @@ class Spilled:
             return bytes(self._held[start:end])
         found = os.pread(self._file.fileno(), end - start, start)  # no seek, which threads would share
         if len(found) != end - start:
-            raise StoreError(f"what was kept in a file in {tempfile.gettempdir()} is shorter now; give the command again")
+            raise StoreError(f"{tempfile.gettempdir()}: the file with {self._what} is shorter now; give the command again")
         return found
 
     def close(self) -> None:

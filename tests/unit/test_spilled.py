@@ -16,7 +16,7 @@ PIECES = [bytes([k]) * (k % 9) for k in range(200)]
 @pytest.mark.parametrize("most", [0, 100, 1 << 20])
 def test_what_was_written_is_read(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spilled, "MOST_IN_MEMORY", most)
-    kept, whole = Spilled(), b"".join(PIECES)
+    kept, whole = Spilled("cameras"), b"".join(PIECES)
     for piece in PIECES:
         kept.append(piece)
     assert kept.read(0, len(whole)) == whole
@@ -27,7 +27,7 @@ def test_what_was_written_is_read(most: int, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_file_that_was_cut_short_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(spilled, "MOST_IN_MEMORY", 0)
-    kept = Spilled()
+    kept = Spilled("cameras")
     kept.append(b"camera")
     assert kept._file is not None
     os.ftruncate(kept._file.fileno(), 3)
