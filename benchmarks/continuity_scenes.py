@@ -20,7 +20,8 @@ from submin.simulation.scene import realise
 from submin.storage.catalogue import Catalogue
 from submin.storage.rpc_import import import_rpc
 from submin.storage.simulated import write_scene
-from submin.tiling.cover import Cover, cover_area
+from submin.tiling.area import cover_area
+from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
 

@@ -6,46 +6,29 @@ use the same trials with fewer kills (``tests/end_to_end/test_faults.py``). Linu
 
 from __future__ import annotations
 
-import hashlib
 import json
-import multiprocessing
 import os
 import random
 import secrets
 import shutil
 import signal
-import socket
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil  # type: ignore[import-untyped]
 from rich.console import Console
 
-import submin
-from orchestration.create import create, fit_catalogue
-from submin.query.control_set import ControlSet
-from submin.simulation.region import RegionDesign, simulate_region
-from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot, versions
-from submin.storage.simulated import write_region
+from benchmarks.fault_scene import Content, Scene, make_scene
+from benchmarks.reader import Reader, Readings
+from benchmarks.started import Command, cluster, free_port, wait_until
+from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import LOCK_FILE
 
-ROOT = Path(__file__).parents[1]
-# a signal that the caller ignores (a job in the background) would be ignored by the command too
-SUBMIN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from orchestration.cli import main; main()"
-EVERYWHERE = (-180.0, -90.0, 180.0, 90.0)
-LONGEST = 300.0
-"""Seconds after which a run counts as hanging."""
 LONGEST_COMMIT = 0.02
 """Seconds that a small commit takes at most, from the first list of what it holds to the new version."""
 IDENTICAL = "identical"
@@ -61,267 +44,6 @@ that were started by Dask's own commands; the others on a local one.
 """
 Moment = Callable[["Command", Path], None]
 """Waits until it is time to kill; it is given the running command and its network."""
-
-
-class Command:
-    """A program in a process group of its own, as a terminal starts it; what it prints goes to files."""
-
-    def __init__(self, words: Sequence[object], log: Path) -> None:
-        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-        self._log = log
-        with log.with_suffix(".out").open("wb") as out, log.with_suffix(".err").open("wb") as err:
-            self.process = subprocess.Popen(
-                [sys.executable, *map(str, words)], stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True,
-                env=os.environ | {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            )  # fmt: skip
-
-    def __enter__(self) -> Command:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Kill what is left of the group."""
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
-
-    @property
-    def out(self) -> str:
-        """What it has printed."""
-        return self._log.with_suffix(".out").read_text()
-
-    @property
-    def err(self) -> str:
-        """What it has printed to standard error."""
-        return self._log.with_suffix(".err").read_text()
-
-    def wait(self, seconds: float = LONGEST) -> int:
-        """Its exit code.
-
-        Raises
-        ------
-        subprocess.TimeoutExpired
-            When it does not end.
-        """
-        return self.process.wait(seconds)
-
-    def workers(self) -> list[psutil.Process]:
-        """Worker processes that it has started."""
-        return [p for p in psutil.Process(self.process.pid).children(recursive=True) if any("spawn_main" in word for word in p.cmdline())]
-
-
-def submin_command(*words: object, log: Path) -> Command:
-    """``submin WORDS``, started."""
-    return Command(["-c", SUBMIN, *words], log)
-
-
-def wait_until(condition: Callable[[], bool], command: Command, seconds: float = LONGEST) -> None:
-    """Look every few milliseconds until a condition holds.
-
-    Raises
-    ------
-    RuntimeError
-        When the command ends before, or the time is over.
-    """
-    end = time.monotonic() + seconds
-    while not condition():
-        if command.process.poll() is not None or time.monotonic() > end:
-            raise RuntimeError(f"what was waited for did not happen; exit code {command.process.poll()}: {command.err}")
-        time.sleep(0.005)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What every trial begins with.
-
-    Attributes
-    ----------
-    folder : for networks and logs; catalogue : simulated; empty : network to copy
-    batch_blocks, workers : of every run
-    """
-
-    folder: Path
-    catalogue: Path
-    empty: Path
-    batch_blocks: int
-    workers: int
-
-    def network(self, name: str) -> Path:
-        """A new copy of the empty network."""
-        return Path(shutil.copytree(self.empty, self.folder / name))
-
-    def run(self, network: Path | str, name: str, *where: object) -> Command:
-        """``submin run``, started; on a local cluster unless told where."""
-        return submin_command(
-            "run", self.catalogue, network, "--batch-blocks", self.batch_blocks, "--json", *(where or ("--workers", self.workers)),
-            log=self.folder / name,
-        )  # fmt: skip
-
-
-def make_scene(folder: Path, side_km: float, batch_blocks: int, workers: int) -> Scene:
-    """A square region and an empty network over it."""
-    write_region(simulate_region(RegionDesign(width_km=side_km, height_km=side_km)), folder / "catalogue")
-    catalogue = Catalogue.open(folder / "catalogue")
-    area, _, _ = fit_catalogue(catalogue)
-    create(str(folder / "empty"), area, catalogue.metadata, 60.0, 20.0)
-    return Scene(folder, folder / "catalogue", folder / "empty", batch_blocks, workers)
-
-
-@dataclass(frozen=True, eq=False)
-class Content:
-    """What two networks are compared by: ledger, rays, the rigorous answer for all points, and what each tile answers alone."""
-
-    ledger: tuple[tuple[object, ...], ...]
-    rays: tuple[tuple[str, str, bool], ...]
-    control: ControlSet
-    tiles: tuple[ControlSet, ...]
-
-    @classmethod
-    def of(cls, network: Path | str) -> Content:
-        """Of the newest version."""
-        opened = submin.open(network)
-        snapshot, rays = opened.snapshot, []
-        images = snapshot.image_columns(["image_id"])["image_id"]
-        for number in snapshot.cell_numbers():
-            cell = snapshot.cell(number, with_sums=False)
-            names = images[cell.images[cell.rays.image]]
-            rays += list(zip(cell.point_ids[cell.rays.point].tolist(), names.tolist(), cell.rays.accepted.tolist(), strict=True))
-        # rays_rejected is a block's count at its own version, before later blocks
-        table = snapshot.ledger(["block_id", "content", "status", "images", "rays"])
-        ledger = zip(*(column.tolist() for column in table.values()), strict=True)
-        tiles = tuple(opened.query(tile=snapshot.cover.tile_name(tile)) for tile in snapshot.tile_numbers())
-        return cls(tuple(sorted(ledger)), tuple(sorted(rays)), opened.query(bbox=EVERYWHERE, policy="rigorous"), tiles)
-
-    def faults(self, other: Content) -> list[str]:
-        """What is wrong with another network that should be the same."""
-        found = []
-        if self.ledger != other.ledger or len({row[0] for row in other.ledger}) < len(other.ledger):
-            found.append("another ledger")
-        if self.rays != other.rays or len({row[:2] for row in other.rays}) < len(other.rays):
-            found.append("other rays")
-        differences = self.differences(other)
-        if np.isnan(differences).any():
-            found.append("other points")
-        elif not max(differences) <= 1e-9:
-            found.append("another answer")
-        return found
-
-    def differences(self, other: Content) -> tuple[float, float]:
-        """Largest difference of coordinates, in standard deviations, and of the covariance, as a correlation. NaN: other points."""
-        if len(self.tiles) != len(other.tiles):
-            return np.nan, np.nan
-        pairs = zip((self.control, *self.tiles), (other.control, *other.tiles), strict=True)
-        moved, spread = np.array([differences(one, another) for one, another in pairs]).max(axis=0)  # which keeps NaN
-        return float(moved), float(spread)
-
-
-def differences(one: ControlSet, other: ControlSet) -> tuple[float, float]:
-    """As `Content.differences`, of two answers."""
-    if one.ids.tolist() != other.ids.tolist():
-        return np.nan, np.nan
-    sigma = np.sqrt(np.diag(one.covariance))
-    moved = np.abs(one.geocentric - other.geocentric).ravel() / sigma
-    spread = np.abs(one.covariance - other.covariance) / sigma / sigma[:, None]
-    return float(moved.max(initial=0.0)), float(spread.max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class Readings:
-    """What a reader saw: number of answers, versions, and everything that was wrong."""
-
-    answers: int
-    versions: tuple[str, ...]
-    faults: tuple[str, ...]
-
-
-def _reading(place: str, version: str | None = None) -> tuple[str, str]:
-    """A version, and the fingerprint of all that it answers: ids, coordinates, covariance, blocks, ledger."""
-    network = submin.open(place, version)
-    control = network.query(bbox=EVERYWHERE, policy="rigorous")
-    if control.version != network.version:
-        raise ValueError(f"asked {network.version}, answered by {control.version}")
-    lines = network.snapshot.ledger(["block_id", "version"])
-    if sorted(control.blocks) != sorted(lines["block_id"].tolist()):
-        raise ValueError(f"{network.version} answers from blocks that are not those of its ledger")
-    fused = max((v.number for v in versions(place) if v.number <= network.snapshot.number and "fused" in v.message), default=0)
-    if int(lines["version"].max(initial=0)) != fused:
-        raise ValueError(f"the ledger of {network.version} ends with version {lines['version'].max(initial=0)}")
-    digest = hashlib.sha256("\n".join([*control.ids.tolist(), *control.blocks, *lines["block_id"].tolist()]).encode())
-    digest.update(control.geocentric.tobytes())
-    digest.update(control.covariance.tobytes())
-    return network.version, f"{len(control)} points, {digest.hexdigest()}"
-
-
-def _read_all_the_time(place: str, stop: Event) -> Readings:
-    """Query until told to stop. In the end every version that was seen is asked once more, at rest: each answer must have been that one."""
-    seen: dict[str, set[str]] = {}
-    answers, last, faults = 0, -1, set()
-    while not (stop.is_set() and answers):
-        started = time.monotonic()
-        try:
-            version, answer = _reading(place)
-            number = int(version.removeprefix("v"))
-            if number < last:
-                faults.add(f"v{last} was followed by {version}")
-            last = number
-            seen.setdefault(version, set()).add(answer)
-            answers += 1
-        except Exception as error:
-            faults.add(f"{type(error).__name__}: {error}")
-            if stop.is_set():
-                break
-        time.sleep(max(2.0 * (time.monotonic() - started), 0.02))  # most of a processor is for the run
-    for version, given in seen.items():
-        if given != {_reading(place, version)[1]}:
-            faults.add(f"{version} gave other answers than it does at rest: {sorted(given)}")
-    return Readings(answers, tuple(seen), tuple(sorted(faults)))
-
-
-def _serve(stop: Event, connection: Connection) -> None:
-    """Body of the reader process: one network after the other."""
-    while True:
-        connection.send(_read_all_the_time(connection.recv(), stop))
-
-
-class Reader:
-    """A process that opens and queries a network all the time."""
-
-    def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._stop = context.Event()
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(self._stop, theirs), daemon=True)
-        self._process.start()
-        theirs.close()
-
-    def __enter__(self) -> Reader:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End the process."""
-        self._process.terminate()
-        self._process.join()
-        self._connection.close()
-
-    @contextmanager
-    def reading(self, network: Path) -> Iterator[Callable[[], Readings]]:
-        """Read a network while the body runs; what is given ends the reading, and says what was read."""
-        readings: list[Readings] = []
-
-        def ended() -> Readings:
-            if not readings:
-                self._stop.set()
-                try:
-                    readings.append(self._connection.recv())
-                except EOFError:
-                    readings.append(Readings(0, (), ("the reader has died",)))
-            return readings[0]
-
-        self._stop.clear()
-        self._connection.send(str(network))
-        try:
-            yield ended
-        finally:
-            ended()
 
 
 @dataclass(frozen=True)
@@ -367,30 +89,6 @@ class TooLate(Exception):
     """The run had ended before the moment of the kill."""
 
 
-@contextmanager
-def cluster(scene: Scene, name: str, port: int) -> Iterator[tuple[Command, Command]]:
-    """A Dask scheduler and its workers in processes of their own, ready."""
-    from distributed import Client
-
-    address = f"tcp://127.0.0.1:{port}"
-    serve = ["-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"]
-    work = ["-m", "dask", "worker", address, "--nworkers", scene.workers, "--nthreads", 1, "--no-dashboard"]
-    with (
-        Command(serve, scene.folder / f"{name}-scheduler") as scheduler,
-        Command([*work, "--local-directory", scene.folder], scene.folder / f"{name}-workers") as workers,
-    ):
-        with Client(address, timeout="60s") as client:
-            client.wait_for_workers(scene.workers, timeout=60)
-        yield scheduler, workers
-
-
-def free_port() -> int:
-    """A port that nobody listens at."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def trial(
     scene: Scene, undisturbed: Content, kind: str, moment: Moment, name: str, rng: random.Random, standing: Standing | None = None
 ) -> Trial:  # fmt: skip
@@ -411,7 +109,7 @@ def trial(
             else:
                 port = free_port()
                 address = f"tcp://127.0.0.1:{port}"
-                scheduler, _ = stack.enter_context(cluster(scene, name, port))
+                scheduler, _ = stack.enter_context(cluster(scene.folder, scene.workers, name, port))
             where = ("--scheduler", address)
         first = stack.enter_context(scene.run(network, f"{name}-first", *where))
         wait_until(lambda: begun(network), first)
@@ -446,7 +144,7 @@ def trial(
             if not (code == 2 and said) and not (code == 0 and not lines and complete):
                 faults.append(f"exit code {code} without its scheduler: {first.err}")
             scheduler.wait()
-            stack.enter_context(cluster(scene, f"{name}-again", port))
+            stack.enter_context(cluster(scene.folder, scene.workers, f"{name}-again", port))
         elif code != 0 or first.err:
             faults.append(f"exit code {code} without its workers: {first.err}")
         else:
@@ -567,7 +265,7 @@ def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None
         batches = -(-len(undisturbed.ledger) // scene.batch_blocks)
         port, kinds = free_port(), KINDS if workers else ("coordinator", IN_COMMIT, AFTER_COMMIT)
         if workers:
-            stack.enter_context(cluster(scene, "cluster", port))
+            stack.enter_context(cluster(scene.folder, scene.workers, "cluster", port))
         standing = Standing(f"tcp://127.0.0.1:{port}" if workers else "", stack.enter_context(Reader()))
         stack.enter_context(suppress(KeyboardInterrupt))  # ends with the rows so far
         while len(rows) < kills:

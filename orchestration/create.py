@@ -22,7 +22,8 @@ from submin.storage.dense_store import create_dense
 from submin.storage.image_footprints import image_footprints
 from submin.storage.network_store import create_network
 from submin.storage.schema import NetworkMetadata
-from submin.tiling.cover import Cover, check_on_globe, cover_area
+from submin.tiling.area import check_on_globe, cover_area
+from submin.tiling.cover import Cover
 from submin.tiling.footprints import footprint_widths, on_globe
 
 FORMS = ("factored", "dense")

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic, geodetic_to_geocentric, local_axes
-from submin.tiling.cover import Cover, polygons_of
+from submin.tiling.area import polygons_of
+from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -20,26 +20,9 @@ import pytest
 import shapely
 from networks import rewrite, same_network
 
-from benchmarks.faults import (
-    EVERYWHERE,
-    IN_COMMIT,
-    IN_STAGE,
-    KINDS,
-    Content,
-    Moment,
-    Scene,
-    after,
-    after_commit,
-    begun,
-    cluster,
-    free_port,
-    in_commit,
-    make_scene,
-    submin_command,
-    trial,
-    undisturbed_run,
-    wait_until,
-)
+from benchmarks.fault_scene import EVERYWHERE, Content, Scene, make_scene
+from benchmarks.faults import IN_COMMIT, IN_STAGE, KINDS, Moment, after, after_commit, begun, in_commit, trial, undisturbed_run
+from benchmarks.started import cluster, free_port, submin_command, wait_until
 from orchestration.create import create
 from orchestration.executors import SerialExecutor, executor_for
 from orchestration.progress import Silent
@@ -198,7 +181,10 @@ def test_without_the_lock_the_commit_decides(
 def test_a_lost_scheduler_is_said_whatever_is_asked_next(scene: Scene) -> None:
     """Also long after the loss, when the client has given up: Dask itself would wait for ever then."""
     port = free_port()
-    with cluster(scene, "lost", port) as (scheduler, _), executor_for(scheduler=f"tcp://127.0.0.1:{port}") as executor:
+    with (
+        cluster(scene.folder, scene.workers, "lost", port) as (scheduler, _),
+        executor_for(scheduler=f"tcp://127.0.0.1:{port}") as executor,
+    ):
         client = executor.client  # type: ignore[attr-defined]
         client._timeout = 1.0  # the seconds for which it tries to connect again
         handle = executor.share(3)

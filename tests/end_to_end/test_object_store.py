@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from command_calls import Call
 
-from benchmarks.faults import EVERYWHERE, Command, Content, Scene, cluster, free_port, make_scene, submin_command, wait_until
+from benchmarks.fault_scene import EVERYWHERE, Content, Scene, make_scene
+from benchmarks.started import Command, cluster, free_port, submin_command, wait_until
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import SerialExecutor
 from orchestration.progress import Silent
@@ -126,7 +127,7 @@ def test_workers_write_to_the_bucket(bucket: str, scene: Scene, in_folder: Conte
     place = created(scene, f"{bucket}/{name}")
     if where == "scheduler":
         port = free_port()
-        with cluster(scene, name, port), scene.run(place, name, "--scheduler", f"tcp://127.0.0.1:{port}") as command:
+        with cluster(scene.folder, scene.workers, name, port), scene.run(place, name, "--scheduler", f"tcp://127.0.0.1:{port}") as command:
             assert command.wait() == 0, command.err
     else:
         with scene.run(place, name) as command:

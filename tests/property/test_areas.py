@@ -15,7 +15,8 @@ from shapely.geometry import MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
-from submin.tiling.cover import MAX_OUTLINE, ZONES, Cover, cover_area, polygons_of
+from submin.tiling.area import MAX_OUTLINE, cover_area, polygons_of
+from submin.tiling.cover import ZONES, Cover
 from submin.tiling.footprints import FootprintIndex, footprint_widths, in_plane, on_globe
 
 Array = NDArray[np.float64]

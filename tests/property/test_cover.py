@@ -18,7 +18,8 @@ from shapely.geometry.base import BaseGeometry
 
 from submin.errors import InputError
 from submin.geodesy import Ellipsoid, geodetic_to_geocentric
-from submin.tiling.cover import MAX_LEVEL, ZONES, Cover, cover_area
+from submin.tiling.area import cover_area
+from submin.tiling.cover import MAX_LEVEL, ZONES, Cover
 
 Array = NDArray[np.float64]
 

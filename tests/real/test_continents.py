@@ -17,7 +17,8 @@ from shapely.geometry.base import BaseGeometry
 
 import submin
 from orchestration.cli import main
-from submin.tiling.cover import Cover, cover_area
+from submin.tiling.area import cover_area
+from submin.tiling.cover import Cover
 from submin.tiling.footprints import FootprintIndex, in_plane
 
 real_data(whole_module=True)

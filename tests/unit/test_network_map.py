@@ -22,7 +22,7 @@ from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.accuracy_map import PointAccuracy
 from submin.storage.catalogue_schema import CatalogueMetadata
 from submin.storage.simulated import write_region
-from submin.tiling.cover import cover_area
+from submin.tiling.area import cover_area
 
 RED = np.array([0xD7, 0x26, 0x3D]) / 255.0
 

@@ -31,7 +31,7 @@ from submin.storage.schema import (
     write_cell,
     write_sub_min,
 )
-from submin.tiling.cover import cover_area
+from submin.tiling.area import cover_area
 
 Array = NDArray[np.float64]
 
