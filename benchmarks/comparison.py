@@ -13,7 +13,7 @@ from scipy.stats import poisson
 from orchestration.create import create, fit_catalogue
 from orchestration.executors import SerialExecutor
 from orchestration.progress import Silent
-from orchestration.reading import looked_at
+from orchestration.reading import ready
 from orchestration.run import fuse_blocks
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
@@ -74,7 +74,7 @@ def network_of(catalogue: Catalogue, place: Path, batches: Iterable[Sequence[Blo
     area, _, _ = fit_catalogue(catalogue)
     create(str(place), area, catalogue.metadata, tile_km, min(100.0, 0.5 * tile_km))
     for batch in batches:
-        tally = fuse_blocks(looked_at(batch), str(place), SerialExecutor(), len(batch), Silent())
+        tally = fuse_blocks(ready(batch), str(place), SerialExecutor(), len(batch), Silent())
         if tally.rejected:
             raise RuntimeError(f"rejected: {tally.rejected[0].block_id}: {tally.rejected[0].reason}")
     return str(place)

@@ -7,7 +7,7 @@ from typing import Any
 
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
-from orchestration.reading import looked_at
+from orchestration.reading import ready
 from orchestration.run import fuse_blocks
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.storage.catalogue_schema import PointTable
@@ -55,7 +55,7 @@ def add_control(points: PointTable, source: str, where: str, executor: Executor,
     reporter = reporter or Silent()
     reporter.begin(len(points))
     blocks = control_blocks(points, Snapshot.open(where).metadata.ellipsoid, source)
-    tally = fuse_blocks(looked_at(blocks), where, executor, max(len(points), 1), reporter)
+    tally = fuse_blocks(ready(blocks), where, executor, max(len(points), 1), reporter)
     rejected = tuple(RejectedPoint(r.points[0] if len(r.points) == 1 else r.block_id, r.reason, r.points) for r in tally.rejected)
     skipped = len(points) - tally.control - sum(len(r.points) for r in rejected)
     ours = set(points.point_ids.tolist())

@@ -25,7 +25,6 @@ SETTINGS = {
 }
 STREAMED = 4
 """Results of a stream that a worker may be ahead of whoever takes them."""
-SENT_AGAIN = 3
 Advance = Callable[[], None]
 T = TypeVar("T")
 
@@ -53,10 +52,14 @@ class Executor(Protocol):
         """Wait until all of some handles are done."""
         ...
 
-    def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
+    def stream(
+        self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str, *, ahead: int | None = None,
+        past_kills: bool = False,
+    ) -> Iterator[Any]:  # fmt: skip
         """The values of a function for tuples of arguments, in their order, a bounded number of them at a time: none is kept.
 
-        A task whose workers were killed again and again is sent `SENT_AGAIN` more times: it may have waited on the worker of another one.
+        ``ahead`` bounds the number further. With ``past_kills`` a task whose workers were killed again and again is done here: it may
+        have waited on the worker of another one.
         """
         ...
 
@@ -111,7 +114,10 @@ class SerialExecutor:
         for _ in handles:
             advance()
 
-    def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
+    def stream(
+        self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str, *, ahead: int | None = None,
+        past_kills: bool = False,
+    ) -> Iterator[Any]:  # fmt: skip
         """See `Executor.stream`."""
         return (recorded(name, function, *args) for args in arguments)
 
@@ -144,7 +150,10 @@ class ThreadExecutor(SerialExecutor):
         self._libraries = ThreadpoolController()
 
     def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
-        """See `Executor.submit_all`. BLAS takes one thread in each task: with several they wait for one another, and for all else."""
+        """See `Executor.submit_all`. BLAS takes one thread in each task: with several they wait for one another, and for all else.
+
+        One task of much dense algebra is for `submit`, which leaves it all cores.
+        """
         with self._libraries.limit(limits=1, user_api="blas"), ThreadPoolExecutor(self._threads, thread_name_prefix=name) as pool:
             handles = [pool.submit(recorded, name, function, *args) for args in arguments]
             try:
@@ -236,27 +245,31 @@ class DaskExecutor:
                     future.result()  # raises the task's error here
                 advance()
 
-    def stream(self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str) -> Iterator[Any]:
+    def stream(
+        self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str, *, ahead: int | None = None,
+        past_kills: bool = False,
+    ) -> Iterator[Any]:  # fmt: skip
         """See `Executor.stream`."""
+        from distributed import KilledWorker
+
+        def value(handle: Any, args: tuple[Any, ...]) -> Any:
+            try:
+                return handle.result()
+            except KilledWorker:
+                if not past_kills:
+                    raise
+                return recorded(name, function, *args)
+
+        most = min(STREAMED * self.workers, ahead or STREAMED * self.workers)
         waiting: deque[tuple[Any, tuple[Any, ...]]] = deque()
         with self._losses_said():
             for args in arguments:
                 waiting.append((self._start(function, args, name), args))
                 self._check_scheduler()
-                if len(waiting) == STREAMED * self.workers:
-                    yield self._streamed(function, *waiting.popleft(), name)
+                if len(waiting) == most:
+                    yield value(*waiting.popleft())
             while waiting:
-                yield self._streamed(function, *waiting.popleft(), name)
-
-    def _streamed(self, function: Callable[..., Any], handle: Any, arguments: tuple[Any, ...], name: str) -> Any:
-        from distributed import KilledWorker
-
-        for _ in range(SENT_AGAIN):
-            try:
-                return handle.result()
-            except KilledWorker:
-                handle = self._start(function, arguments, name)
-        return handle.result()
+                yield value(*waiting.popleft())
 
     def _attempt(self, handle: Any) -> Any:
         try:

@@ -6,6 +6,7 @@ import logging
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -32,7 +33,10 @@ SETTINGS = {
 }
 
 LISTENING = {"protocol": ["tcp://", "inproc://"], "host": ["127.0.0.1", ""]}
-"""Where the scheduler listens: for workers at a port of this machine, for the client, which is in its own process, without a copy."""
+"""Where the scheduler listens: for workers at a port of this machine, for the client, which is in its own process, without a copy.
+
+What a task is given must therefore not be changed afterwards: a task that runs again is given the very arrays of the coordinator.
+"""
 
 
 class Deserted(threading.Event):
@@ -49,15 +53,21 @@ def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
 
     compile_kernels()
     with dask.config.set(SETTINGS):
-        with _children_deaf_to_ctrl_c():
+        with _children_deaf_to_ctrl_c(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # where there is no network, of which nothing here depends
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL,
                 scheduler_kwargs=LISTENING,
             )  # fmt: skip
-        scheduler: Any = cluster.scheduler
-        with cluster, Client(scheduler.listeners[-1].contact_address) as client, _watched(cluster, client) as deserted, seldom_collected():
+        with cluster, Client(_in_process(cluster)) as client, _watched(cluster, client) as deserted, seldom_collected():
             client.register_plugin(Prepared())
             yield client, deserted
+
+
+def _in_process(cluster: Any) -> str:
+    """The address at which the scheduler listens in this process."""
+    found: list[str] = [listener.contact_address for listener in cluster.scheduler.listeners]
+    return next(address for address in found if address.startswith("inproc://"))
 
 
 @contextmanager

@@ -21,50 +21,56 @@ BLOCKS_TOGETHER = 16
 
 
 @dataclass(frozen=True)
-class ReadBlock:
-    """A block with all that it tells alone; the numbers of its points and its hash are worked out.
+class Incoming:
+    """A block on its way into a network, with what can be told of it before its rays are adjusted.
 
     Attributes
     ----------
-    block : as the catalogue has it
-    defect : why it cannot be used, or None
-    images : its images as a network has them; none of a block with a defect
+    block : as the catalogue has it; the numbers of its points and its hash are worked out
+    reason : why it cannot come in, or None
+    images : its images as a network has them; none of a block that cannot come in
     """
 
     block: Block
-    defect: str | None
+    reason: str | None
     images: tuple[NetworkImage, ...]
 
+    def refused(self, reason: str) -> Incoming:
+        """The same block, which cannot come in for another reason."""
+        return Incoming(self.block, reason, ())
 
-def read_catalogue(catalogue: Catalogue, executor: Executor) -> Iterator[ReadBlock]:
-    """Every block of a catalogue, in its order, a bounded number at a time.
+
+def read_catalogue(catalogue: Catalogue, executor: Executor, batch_blocks: int) -> Iterator[Incoming]:
+    """Every block of a catalogue, in its order; at most a batch of them is under way.
 
     Raises
     ------
     CatalogueError
         As `Catalogue.block_rows`.
     """
-    for group in executor.stream(read_rows, ((group,) for group in _groups(catalogue.block_rows())), "read"):
-        yield from group
+    groups = ((rows,) for rows in _groups(catalogue.block_rows()))
+    ahead = -(-max(batch_blocks, 1) // BLOCKS_TOGETHER)
+    for ready in executor.stream(ready_from_rows, groups, "read", ahead=ahead, past_kills=True):
+        yield from ready
 
 
-def read_rows(rows: Sequence[BlockRows]) -> list[ReadBlock]:
-    """The blocks of some rows."""
-    return _looked_at([of_block.block() for of_block in rows])
-
-
-def looked_at(blocks: Iterable[Block]) -> Iterator[ReadBlock]:
-    """Blocks that are here already."""
+def ready(blocks: Iterable[Block]) -> Iterator[Incoming]:
+    """Blocks that are here already, made ready here."""
     for group in _groups(blocks):
-        yield from _looked_at(group)
+        yield from _ready(group)
 
 
-def _looked_at(blocks: Sequence[Block]) -> list[ReadBlock]:
+def ready_from_rows(rows: Sequence[BlockRows]) -> list[Incoming]:
+    """A task: the blocks of some rows, made ready. What is wrong with the values of one is the reason of that block, and no error."""
+    return _ready([of_block.block() for of_block in rows])
+
+
+def _ready(blocks: Sequence[Block]) -> list[Incoming]:
     for block in blocks:
-        block.content_hash()
-    of_block = [defects(block) for block in blocks]
-    images = iter(images_of_blocks([block for block, defect in zip(blocks, of_block, strict=True) if defect is None]))
-    return [ReadBlock(block, defect, next(images) if defect is None else ()) for block, defect in zip(blocks, of_block, strict=True)]
+        block.content_hash()  # kept in the block, as the numbers of its points are, it travels with it
+    reasons = [defects(block) for block in blocks]
+    images = iter(images_of_blocks([block for block, reason in zip(blocks, reasons, strict=True) if reason is None]))
+    return [Incoming(block, reason, next(images) if reason is None else ()) for block, reason in zip(blocks, reasons, strict=True)]
 
 
 def _groups(values: Iterable[T]) -> Iterator[list[T]]:

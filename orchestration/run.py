@@ -17,13 +17,12 @@ from orchestration.batch import BatchResult, Doubtful, Rejected, fuse_batch
 from orchestration.executors import Executor
 from orchestration.progress import Reporter, Silent
 from orchestration.read_ahead import batches_ahead
-from orchestration.reading import ReadBlock, looked_at, read_catalogue
+from orchestration.reading import Incoming, read_catalogue, ready
 from orchestration.task_record import TaskRecord
 from orchestration.tasks import FlaggedImage
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import InputError
 from submin.network.innovation import REJECTED
-from submin.network.network_image import NetworkImage
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, observed_positions, points_of
@@ -157,7 +156,7 @@ def run(
     clusters = sum(1 for _ in catalogue.observations())
     reporter.begin(catalogue.block_count + (0 if control is None else len(control)) + clusters)
     surveyed = () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
-    every = chain(read_catalogue(catalogue, executor), looked_at(chain(surveyed, observed)))
+    every = chain(read_catalogue(catalogue, executor, batch_blocks), ready(chain(surveyed, observed)))
     check = catalogue.points("check")
     tally = fuse_blocks(
         every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids, validated
@@ -202,7 +201,7 @@ def observation_blocks(catalogue: Catalogue) -> Iterator[Block]:
 
 
 def fuse_blocks(
-    blocks: Iterable[ReadBlock], place: str, executor: Executor, batch_blocks: int, reporter: Reporter, innovation: float = REJECTED,
+    blocks: Iterable[Incoming], place: str, executor: Executor, batch_blocks: int, reporter: Reporter, innovation: float = REJECTED,
     check_points: NDArray[np.str_] | None = None, validated: Callable[[], object] = lambda: None,
 ) -> Tally:  # fmt: skip
     """Fuse those of some blocks that the network does not have yet, so many to a commit; it remembers ``check_points`` with them.
@@ -228,7 +227,7 @@ def fuse_blocks(
                 executor.give_back()
             good = [come.block for come in batch if come.reason is None]
             refused = [Rejected.of(come.block, come.reason) for come in batch if come.reason is not None]
-            images = {come.block.block_id: come.images for come in batch}
+            images = {come.block.block_id: come.images for come in batch if come.reason is None}
             directory.result()
             tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points, known))
             known = None  # with all that it has read
@@ -260,26 +259,17 @@ def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Incoming:
-    """A block that the network does not have: why it cannot come in, if so, and its images as the network will have them, if not."""
-
-    block: Block
-    reason: str | None
-    images: tuple[NetworkImage, ...]
-
-
-def _new_blocks(blocks: Iterable[ReadBlock], ledger: Ledger, tally: Tally, reporter: Reporter) -> Iterator[_Incoming]:
+def _new_blocks(blocks: Iterable[Incoming], ledger: Ledger, tally: Tally, reporter: Reporter) -> Iterator[Incoming]:
     """Blocks that the network does not have."""
-    for read in blocks:
-        if ledger.holds(read.block):
-            tally.skipped += read.block.kind == "images"
+    for come in blocks:
+        if ledger.holds(come.block):
+            tally.skipped += come.block.kind == "images"
             reporter.fused(1)
             continue
-        reason = ledger.refusal(read.block) or read.defect
-        if reason is None:
-            ledger.enter(read.block)
-        yield _Incoming(read.block, reason, read.images)
+        refusal = ledger.refusal(come.block)  # it comes before what is wrong with the block
+        if refusal is None and come.reason is None:
+            ledger.enter(come.block)
+        yield come if refusal is None else come.refused(refusal)
 
 
 def check_frames(catalogue: Catalogue, snapshot: Snapshot) -> None:

@@ -37,8 +37,9 @@ def signals_stop() -> Iterator[None]:
     """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is.
 
     Where that is a finaliser or a callback of the garbage collector, Python would print what is raised and go on: then the signal is
-    sent once more, soon after. Later signals leave the program to clean up in peace, for so long as that may take; then they end the
-    process as it is, which loses nothing that is committed.
+    sent once more, soon after. (Code that swallows every exception in another way swallows this one too.) Later signals leave the
+    program to clean up in peace, for so long as that may take; then they end the process as it is, which loses nothing that is
+    committed.
     """
     first: float | None = None
     again: list[threading.Timer] = []
@@ -58,6 +59,7 @@ def signals_stop() -> Iterator[None]:
             return
         first = None
         again.append(threading.Timer(SOON_SECONDS, signal.pthread_kill, (threading.main_thread().ident, what.exc_value.number)))
+        again[-1].daemon = True
         again[-1].start()
 
     # a signal that is ignored already (a job in the background) stays ignored
@@ -66,6 +68,7 @@ def signals_stop() -> Iterator[None]:
     try:
         yield
     finally:
+        first = first or time.monotonic()  # what comes from here on must not break off what follows
         for timer in again:
             timer.cancel()
             timer.join()

@@ -14,6 +14,8 @@ def along_hilbert(places: NDArray[np.float64]) -> NDArray[np.int64]:
 
     Cells with following numbers have a side in common, so that any stretch of the curve is one compact piece of the plane (Hilbert 1891).
     """
+    if not len(places):
+        return np.empty(0, dtype=np.int64)
     low, side = places.min(axis=0), max(float(np.ptp(places, axis=0).max()), 1e-300)
     x, y = np.minimum(((places - low) / side * 2**LEVELS).astype(np.int64), 2**LEVELS - 1).T
     number = np.zeros(len(places), dtype=np.int64)

@@ -21,7 +21,7 @@ from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from orchestration.info import describe
 from orchestration.progress import Silent
-from orchestration.reading import looked_at
+from orchestration.reading import ready
 from orchestration.reconcile import reconcile
 from orchestration.run import fuse_blocks, run
 from orchestration.withdraw import withdraw
@@ -240,7 +240,7 @@ def test_order_does_not_matter(region: SimulatedRegion, catalogue: Path, base: P
         network = str(tmp_path / name)
         create(network, area_of(region), opened.metadata, TILE_KM, OVERLAP_KM)
         if before:
-            fuse_blocks(looked_at(blocks[:before]), network, HERE, before, Silent())
+            fuse_blocks(ready(blocks[:before]), network, HERE, before, Silent())
         add_control(control, "test", network, HERE)
         if not before:
             alone = submin.open(network).query(bbox=EVERYWHERE, policy="rigorous")
@@ -249,7 +249,7 @@ def test_order_does_not_matter(region: SimulatedRegion, catalogue: Path, base: P
             assert control.joint_covariance is not None
             np.testing.assert_allclose(alone.covariance, control.joint_covariance[np.ix_(at, at)], rtol=0.0, atol=1e-12)
             np.testing.assert_allclose(alone.geodetic, control.geodetic[order], rtol=0.0, atol=1e-8)
-        fuse_blocks(looked_at(blocks[before:]), network, HERE, 4, Silent())
+        fuse_blocks(ready(blocks[before:]), network, HERE, 4, Silent())
         same_network(base, Path(network))
 
 
@@ -389,7 +389,7 @@ def test_observed_positions_are_correlated_control(base: Path, control: PointTab
     values = geodetic_to_geocentric(control.geodetic, WGS84)
     nowhere = np.full(6, "", dtype="U1")
     block = observed_positions(Cluster("session 7", control.point_ids, nowhere, values, control.joint_covariance), WGS84, "obs")
-    tally = fuse_blocks(looked_at([block]), str(other), HERE, 1, Silent())
+    tally = fuse_blocks(ready([block]), str(other), HERE, 1, Silent())
     assert (tally.fused, tally.control, tally.observations) == (0, 0, 1)
     ledger = Ledger.of(Snapshot.open(str(other)))
     assert ledger.entries["session 7"].kind == "observations"

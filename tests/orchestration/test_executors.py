@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 import tracemalloc
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,11 @@ import dask
 import distributed
 import pytest
 from distributed import Client, LocalCluster
+from distributed.comm import inproc
 from networks import SMALL, area_of, fuse
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from orchestration import executors, local_cluster
+from orchestration import local_cluster
 from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, ThreadExecutor, executor_for
 from orchestration.read_ahead import batches_ahead
 from submin.errors import ClusterError, InputError, KilledTaskError
@@ -51,13 +53,9 @@ def kill_for_three(value: int) -> int:
     return kill_the_worker(value) if value == 3 else double(value)
 
 
-def kill_three_times(folder: Path, value: int) -> int:
-    """Value 2 kills the first three workers that it comes to."""
-    killed = len(list(folder.iterdir()))
-    if value == 2 and killed < 3:
-        (folder / str(killed)).touch()
-        kill_the_worker(value)
-    return double(value)
+def kill_elsewhere(home: int, value: int) -> int:
+    """Value 2 kills every process that it comes to, but for one."""
+    return kill_the_worker(value) if value == 2 and os.getpid() != home else double(value)
 
 
 @pytest.fixture(scope="module")
@@ -125,12 +123,14 @@ def test_a_stream_comes_in_order_and_is_bounded(cluster: LocalCluster) -> None:
     with Client(cluster) as client:
         for executor, most in ((SerialExecutor(), 1), (DaskExecutor(client), STREAMED * 2)):
             asked: list[int] = []
-            arguments = ((asked.append(k) or executor.share(k),) for k in range(40))
-            taken = []
-            for value in executor.stream(double, arguments, "stream"):
-                taken.append(value)
-                assert len(asked) <= len(taken) - 1 + most
-            assert taken == [2 * k for k in range(40)]
+            for ahead in (None, 3):
+                asked.clear()
+                taken = []
+                arguments = ((asked.append(k) or executor.share(k),) for k in range(40))
+                for value in executor.stream(double, arguments, "stream", ahead=ahead):
+                    taken.append(value)
+                    assert len(asked) <= len(taken) - 1 + min(most, ahead or most)
+                assert taken == [2 * k for k in range(40)]
 
 
 def test_an_error_in_a_stream_is_the_callers(cluster: LocalCluster) -> None:
@@ -248,15 +248,27 @@ def test_past_a_task_that_kills_its_workers() -> None:
             executor.attempt_all(fail, [(0,)], "fail", lambda: None)
 
 
-def test_a_stream_goes_on_past_killed_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its tasks may have waited on the worker of another one that kills; one that kills for ever is named."""
+def test_a_stream_goes_on_past_killed_workers() -> None:
+    """A task may have waited on the worker of another one that kills: it is done here, where that is asked for."""
     with dask.config.set({"distributed.scheduler.allowed-failures": 1}), executor_for(1) as executor:
-        values = executor.stream(kill_three_times, ((tmp_path, k) for k in range(6)), "stream")
+        values = executor.stream(kill_elsewhere, ((os.getpid(), k) for k in range(6)), "stream", past_kills=True)
         assert list(values) == [0, 2, 4, 6, 8, 10]
-        assert len(list(tmp_path.iterdir())) == 3
-        monkeypatch.setattr(executors, "SENT_AGAIN", 0)
         with pytest.raises(KilledTaskError, match=r"2 workers that ran the same task \(stream\)"):
             list(executor.stream(kill_the_worker, [(1,)], "stream"))
+
+
+def test_a_local_cluster_needs_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dask asks the system for the way to the outside before it listens inside this process, and warns where there is none."""
+
+    def nowhere() -> str:
+        warnings.warn("no way out", RuntimeWarning, stacklevel=1)
+        return "127.0.0.1"
+
+    monkeypatch.setattr(inproc.global_manager, "_ip", None)
+    monkeypatch.setattr(inproc, "get_ip", nowhere)
+    with executor_for(1) as executor:
+        assert executor.results(executor.submit_all(double, [(4,)], "double", lambda: None)) == [8]
+        assert executor.client.scheduler.address.startswith("inproc://127.0.0.1/")  # type: ignore[attr-defined]
 
 
 def test_an_input_or_output_error_of_a_task_is_no_lost_scheduler(cluster: LocalCluster) -> None:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import gzip
 import pickle
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pcsv
 import pyarrow.parquet as pq
 import pytest
-from networks import rewrite
+from networks import area_of, fuse, rewrite
 
-from orchestration.executors import SerialExecutor, executor_for
-from orchestration.reading import BLOCKS_TOGETHER, ReadBlock, looked_at, read_catalogue
+from orchestration.executors import Executor, SerialExecutor, executor_for
+from orchestration.reading import BLOCKS_TOGETHER, Incoming, read_catalogue, ready
 from submin.errors import CatalogueError
+from submin.simulation.region import SimulatedRegion
 from submin.storage.block_images import network_images
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, defects
@@ -22,11 +26,18 @@ from submin.storage.catalogue_schema import Block, defects
 
 @pytest.fixture(scope="module")
 def many(catalogue: Path, tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
-    """More blocks than are made ready together; in one of them a ray is far outside of its image."""
+    """More blocks than are made ready together; in one of them a ray is far outside of its image, and one has none."""
     blocks = list(Catalogue.open(catalogue).blocks())
     parts = [part for block in blocks for part in _copies(block, 2 * BLOCKS_TOGETHER // len(blocks) + 1)]
     parts[3].sample[1] = -1e6
+    parts[5] = _without_rays(parts[5])
     return Catalogue.open(rewrite(catalogue, tmp_path_factory.mktemp("many") / "catalogue", parts))
+
+
+@pytest.fixture(scope="module")
+def worker() -> Iterator[Executor]:
+    with executor_for(1) as executor:
+        yield executor
 
 
 def _copies(block: Block, count: int) -> list[Block]:
@@ -39,49 +50,77 @@ def _copies(block: Block, count: int) -> list[Block]:
     ]  # fmt: skip
 
 
+def _without_rays(block: Block) -> Block:
+    of_rays = ("point_ids", "image", "sample", "line", "sigma_sample", "sigma_line")
+    return replace(block, **{name: getattr(block, name)[:0] for name in of_rays})
+
+
 def same(one: Block, other: Block) -> bool:
     return all(np.array_equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Block) if f.name != "images") and (
         one.images == other.images and one.content_hash() == other.content_hash()
     )
 
 
-def check(found: list[ReadBlock], catalogue: Catalogue) -> None:
+def check(found: list[Incoming], catalogue: Catalogue) -> None:
     expected = list(catalogue.blocks())
     assert len(found) == len(expected) > 2 * BLOCKS_TOGETHER
-    for read, block in zip(found, expected, strict=True):
-        assert same(read.block, block)
-        assert read.defect == defects(block)
-        assert read.images == (network_images(block) if read.defect is None else ())
-    (bad,) = (read for read in found if read.defect is not None)
-    assert bad.defect is not None and "sample is -1e+06" in bad.defect
+    for come, block in zip(found, expected, strict=True):
+        assert same(come.block, block)
+        assert come.reason == defects(block)
+        assert come.images == (network_images(block) if come.reason is None else ())
+    reasons = [come.reason for come in found if come.reason is not None]
+    assert len(reasons) == 2 and "sample is -1e+06" in reasons[0] and "has no measurements" in reasons[1]
 
 
-def test_read_here_and_by_workers(many: Catalogue) -> None:
-    check(list(read_catalogue(many, SerialExecutor())), many)
-    check(list(looked_at(many.blocks())), many)
-    with executor_for(2) as executor:
-        check(list(read_catalogue(many, executor)), many)
+def test_ready_here_and_by_a_worker(many: Catalogue, worker: Executor) -> None:
+    for executor in (SerialExecutor(), worker):
+        for batch_blocks in (1, 2000):
+            check(list(read_catalogue(many, executor, batch_blocks)), many)
+    check(list(ready(many.blocks())), many)
 
 
-def test_workers_leave_little_to_do(many: Catalogue) -> None:
+@pytest.mark.parametrize("sigma", [("sigma_sample", "sigma_line"), ()])
+def test_any_table_that_the_coordinator_can_read_will_do(many: Catalogue, worker: Executor, tmp_path: Path, sigma: tuple[str, ...]) -> None:
+    """As gzipped CSV, with or without sigmas."""
+    copy = rewrite(many.path, tmp_path / "catalogue", list(many.blocks()))
+    table = pq.read_table(copy / "measurements.parquet")
+    kept = [name for name in table.column_names if not name.startswith("sigma") or name in sigma]
+    with gzip.open(copy / "measurements.csv.gz", "wb") as file:
+        pcsv.write_csv(table.select(kept), file)
+    (copy / "measurements.parquet").unlink()
+    opened = Catalogue.open(copy)
+    check(list(read_catalogue(opened, worker, 2000)), opened)
+
+
+def test_workers_leave_little_to_do(many: Catalogue, worker: Executor) -> None:
     """Numbers of points and hash travel with a block."""
-    with executor_for(1) as executor:
-        assert all({"points", "_content_hash"} <= set(vars(read.block)) for read in read_catalogue(many, executor))
+    assert all({"points", "_content_hash"} <= set(vars(come.block)) for come in read_catalogue(many, worker, 2000))
 
 
 def test_only_the_rows_of_the_block_are_sent(many: Catalogue) -> None:
-    whole = sum(path.stat().st_size for path in many.path.glob("measurements.*"))
-    rows = list(many.block_rows())
-    sent = [len(pickle.dumps(each.table, protocol=5)) for each in rows], [len(pickle.dumps(each, protocol=5)) for each in rows]
-    assert max(sent[1]) < 0.2 * min(sent[0]) and max(sent[1]) < whole  # a slice by itself brings the whole batch
+    rows = [each for each in many.block_rows() if len(each.image)]
+    with_batch = min(len(pickle.dumps(each.table, protocol=5)) for each in rows)  # a slice by itself brings the whole batch
+    assert max(len(pickle.dumps(each, protocol=5)) for each in rows) < 0.2 * with_batch
     again = [pickle.loads(pickle.dumps(each, protocol=5)) for each in rows]
     assert all(same(one.block(), other.block()) for one, other in zip(again, rows, strict=True))
 
 
-def test_an_error_of_the_table_comes_where_it_is(many: Catalogue, tmp_path: Path) -> None:
+def test_an_error_of_the_table_is_the_readers(many: Catalogue, worker: Executor, tmp_path: Path) -> None:
     broken = rewrite(many.path, tmp_path / "catalogue", list(many.blocks()))
     table = pq.read_table(broken / "measurements.parquet")
-    last = table.slice(0, 1)  # the first block comes back
-    pq.write_table(pa.concat_tables([table, last]), broken / "measurements.parquet")
-    with executor_for(1) as executor, pytest.raises(CatalogueError, match="comes back after"):
-        list(read_catalogue(Catalogue.open(broken), executor))
+    pq.write_table(pa.concat_tables([table, table.slice(0, 1)]), broken / "measurements.parquet")  # the first block comes back
+    with pytest.raises(CatalogueError, match="comes back after"):
+        list(read_catalogue(Catalogue.open(broken), worker, 2000))
+
+
+def test_what_the_network_has_against_a_block_is_said_first(region: SimulatedRegion, catalogue: Path, tmp_path: Path) -> None:
+    """Images that came in another block already, and beside it a ray far outside: the first decides, and is mended first."""
+    blocks = list(Catalogue.open(catalogue).blocks())[:3]
+    network = tmp_path / "network"
+    fuse(rewrite(catalogue, tmp_path / "first", blocks), network, area_of(region))
+    twin = replace(
+        blocks[0], block_id="twin", sample=blocks[0].sample.copy(), images=tuple(replace(i, block_id="twin") for i in blocks[0].images)
+    )
+    twin.sample[0] = -1e6
+    (rejected,) = fuse(rewrite(catalogue, tmp_path / "second", [twin]), network, area_of(region)).rejected
+    assert rejected.reason.endswith("an image counts once")

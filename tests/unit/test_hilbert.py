@@ -26,8 +26,9 @@ def test_stretches_are_compact() -> None:
         assert np.median(boxes) <= 3 * cells
 
 
-def test_scale_and_place_do_not_matter_and_one_place_is_enough() -> None:
+def test_scale_and_place_do_not_matter_and_one_place_or_none_is_enough() -> None:
     places = np.random.default_rng(3).uniform(size=(500, 2))
     number = along_hilbert(places)
     assert np.array_equal(along_hilbert(1024.0 * places - 4096.0), number)
     assert along_hilbert(places[:1]).tolist() == [0]
+    assert along_hilbert(places[:0]).tolist() == []
