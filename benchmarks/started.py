@@ -88,19 +88,19 @@ def wait_until(condition: Callable[[], bool], command: Command, seconds: float =
 
 
 @contextmanager
-def cluster(folder: Path, workers: int, name: str, port: int) -> Iterator[tuple[Command, Command]]:
-    """A Dask scheduler and its workers in processes of their own, ready."""
+def cluster(folder: Path, processes: int, name: str, port: int) -> Iterator[tuple[Command, Command]]:
+    """A Dask scheduler and so many workers, in processes of their own, ready; what they print goes to files in a folder."""
     from distributed import Client
 
     address = f"tcp://127.0.0.1:{port}"
     serve = ["-m", "dask", "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"]
-    work = ["-m", "dask", "worker", address, "--nworkers", workers, "--nthreads", 1, "--no-dashboard"]
+    work = ["-m", "dask", "worker", address, "--nworkers", processes, "--nthreads", 1, "--no-dashboard"]
     with (
         Command(serve, folder / f"{name}-scheduler") as scheduler,
         Command([*work, "--local-directory", folder], folder / f"{name}-workers") as workers,
     ):
         with Client(address, timeout="60s") as client:
-            client.wait_for_workers(workers, timeout=60)
+            client.wait_for_workers(processes, timeout=60)
         yield scheduler, workers
 
 
