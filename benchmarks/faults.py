@@ -33,7 +33,7 @@ LONGEST_COMMIT = 0.02
 """Seconds that a small commit takes at most, from the first list of what it holds to the new version."""
 IDENTICAL = "identical"
 """Verdict on a trial without faults."""
-STAGES = ("read", "adjust", "update-tile", "factor-tile", "collect-tile", "distribute-tile")
+STAGES = ("adjust", "update-tile", "factor-tile", "collect-tile", "distribute-tile")
 """Tasks of a run, by the names that the cluster gives them."""
 IN_STAGE, IN_COMMIT, AFTER_COMMIT = "worker in ", "coordinator in a commit", "coordinator after a commit"
 KINDS = ("one worker", "all workers", *(IN_STAGE + stage for stage in STAGES), "coordinator", IN_COMMIT, AFTER_COMMIT, "scheduler")
