@@ -54,7 +54,7 @@ def local_cluster(workers: int) -> Iterator[tuple[Any, Deserted]]:
     compile_kernels()
     with dask.config.set(SETTINGS):
         with _children_deaf_to_ctrl_c(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # where there is no network, of which nothing here depends
+            warnings.simplefilter("ignore", RuntimeWarning)  # told where there is no network, on which nothing here depends
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=logging.CRITICAL,
                 scheduler_kwargs=LISTENING,

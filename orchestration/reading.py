@@ -50,8 +50,8 @@ def read_catalogue(catalogue: Catalogue, executor: Executor, batch_blocks: int) 
     """
     groups = ((rows,) for rows in _groups(catalogue.block_rows()))
     ahead = -(-max(batch_blocks, 1) // BLOCKS_TOGETHER)
-    for ready in executor.stream(ready_from_rows, groups, "read", ahead=ahead, past_kills=True):
-        yield from ready
+    for made in executor.stream(ready_from_rows, groups, "read", ahead=ahead, past_kills=True):
+        yield from made
 
 
 def ready(blocks: Iterable[Block]) -> Iterator[Incoming]:

@@ -16,6 +16,7 @@ from types import FrameType
 
 PATIENCE_SECONDS = 10.0
 SOON_SECONDS = 0.05
+"""After which a signal that was swallowed is sent once more: a finaliser has ended by then."""
 SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import zarr
 from numpy.typing import NDArray
+from registering import assert_same
 from shapely.geometry import box
 
 import submin
@@ -67,16 +68,6 @@ def random_cell(number: int, seed: int = 1, points: int = 5) -> Cell:
         images, rng.normal(size=(4, 6)), rays,
         Sums(np.tril(rng.normal(size=(24, 24))), rng.normal(size=24), 12.5, 17),
     )  # fmt: skip
-
-
-def assert_same_cell(found: Cell, expected: Cell) -> None:
-    assert found.number == expected.number
-    for name in ("point_ids", "origin", "linearised_at", "images", "theta"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    for name in ("point", "image", "observed", "sigma", "accepted"):
-        np.testing.assert_array_equal(getattr(found.rays, name), getattr(expected.rays, name))
-        assert getattr(found.rays, name).dtype == getattr(expected.rays, name).dtype
-    assert found.images.dtype == expected.images.dtype
 
 
 def image_columns(count: int, first: int = 0) -> dict[str, NDArray[Any]]:
@@ -317,7 +308,7 @@ def test_tag_survives_what_comes_later(tmp_path: Path) -> None:
     assert {v.name: v.tags for v in versions(place)} == {"v4": (), "v3": (), "v2": ("delivery",), "v1": (), "v0": ()}
     snapshot = Snapshot.open(place, "delivery")
     assert (snapshot.version, snapshot.image_count()) == ("v2", 1)
-    assert_same_cell(snapshot.cell(number), cell)
+    assert_same(snapshot.cell(number), cell)
     network = submin.open(place)
     assert (network.version, network.at("delivery").version, network.at("delivery").at("v4").version) == ("v4", "v2", "v4")
     assert Snapshot.open(place).image_count() == 5
@@ -373,12 +364,12 @@ def test_cell_comes_back(tmp_path: Path) -> None:
     snapshot = Snapshot.open(place)
     assert snapshot.cell_numbers() == (number,)
     found = snapshot.cell(number)
-    assert_same_cell(found, cell)
+    assert_same(found, cell)
     np.testing.assert_array_equal(found.sums.information, cell.sums.information)
     np.testing.assert_array_equal(found.sums.vector, cell.sums.vector)
     assert (found.sums.misclosure, found.sums.redundancy) == (12.5, 17)
     without = snapshot.cell(number, with_sums=False)
-    assert_same_cell(without, cell)
+    assert_same(without, cell)
     assert without.sums.information.size == 0
     attributes = snapshot.cell_counts([number])[0]
     accepted = [int(cell.rays.accepted[cell.rays.point == j].sum()) for j in range(len(cell))]
@@ -398,8 +389,8 @@ def test_cell_is_replaced_whole_and_its_past_stays(tmp_path: Path) -> None:
     old, later = random_cell(number, seed=1, points=6), random_cell(number, seed=2, points=2)
     write(place, 1, lambda root: write_cell(root, name, old, 0.0, 0))
     write(place, 2, lambda root: write_cell(root, name, later, 0.0, 0))
-    assert_same_cell(Snapshot.open(place).cell(number), later)
-    assert_same_cell(Snapshot.open(place, "v1").cell(number), old)
+    assert_same(Snapshot.open(place).cell(number), later)
+    assert_same(Snapshot.open(place, "v1").cell(number), old)
 
 
 def test_finer_cover_finds_the_cells_that_it_has_in_common(tmp_path: Path) -> None:
@@ -422,13 +413,13 @@ def test_finer_cover_finds_the_cells_that_it_has_in_common(tmp_path: Path) -> No
     assert snapshot.cell_numbers() == (same, part)
     assert snapshot.tile_numbers() == (finer.quarters(0)[0],)
     for cell in cells:
-        assert_same_cell(snapshot.cell(cell.number), cell)
+        assert_same(snapshot.cell(cell.number), cell)
     # a change sees the version that it starts from with the tiles that it makes
     base = Snapshot.open(place, "v1")
     making = Snapshot(base.root, place, finer)
     assert making.cover == finer and making.number == 1
     assert making.cell_numbers() == (same,)
-    assert_same_cell(making.cell(same), cells[0])
+    assert_same(making.cell(same), cells[0])
     assert len(making.cell(part)) == 0
 
 
