@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestration.tasks import BlockRays, adjust_block
+from orchestration.stage_one import BlockRays, adjust_block
 from submin.geodesy import WGS84, geodetic_to_geocentric
 from submin.network.network_image import NetworkImage
 from submin.sensors import Ground, sensor_named

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestration.batch import block_rays, disagreement
 from orchestration.run import check_frames
-from orchestration.tasks import adjust_block
+from orchestration.stage_one import BlockRays, adjust_block
 from submin.accuracy import accuracy_against_truth, nees_per_dof
 from submin.adjustment.control import ControlledPrior, correlated, covariance_factor, surveyed, uncontrolled
 from submin.adjustment.controlled_adjustment import FAR_METRES, ControlledAdjustment, adjust_controlled
@@ -160,8 +159,8 @@ def _judged(block: Block, catalogue: Catalogue, network: str | None, version: st
         _refuse_known(block, Ledger.of(snapshot), network)
         parameters = max(parameters, snapshot.metadata.parameters)
     if reason is None:
-        outcome = adjust_block(block_rays(block), ellipsoid)
-        reason = outcome.reason or disagreement(outcome.accepted)
+        outcome = adjust_block(BlockRays.of(block), ellipsoid)
+        reason = outcome.reason
     if reason is not None:
         raise InputError(f"{named(block.block_id)}: {reason}")
     images = image_set(network_images(block), ellipsoid, parameters)

@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from orchestration.change import Move, finish, place, settle, take_points
 from orchestration.executors import Executor
+from orchestration.gate import Candidate, common_cells, tested
 from orchestration.progress import Reporter
-from orchestration.tasks import BlockAdjustment, BlockRays, FlaggedImage, Gate, adjust_blocks
+from orchestration.reading import Incoming
+from orchestration.stage_one import BlockAdjustment, BlockRays, adjust_blocks
+from orchestration.tasks import FlaggedImage
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import KilledTaskError
 from submin.geodesy import Ellipsoid, geocentric_to_geodetic
 from submin.network.innovation import REJECTED, BlockTest
-from submin.network.network_image import NetworkImage
 from submin.network.registration import LooseRays, together
-from submin.storage.block_images import network_images
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import enter_check_points
 from submin.storage.control_blocks import points_of
@@ -30,11 +31,8 @@ from submin.storage.network_store import Snapshot, begin_change
 from submin.tiling.cover import Cover
 
 T = TypeVar("T")
-ImagesOf = Mapping[str, tuple[NetworkImage, ...]]
 
 BLOCKS_A_TASK = 16
-LEAST_AGREEING = 0.5
-"""Part of a block's rays that its own adjustment must accept: fewer are no blunders in a good block."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +83,13 @@ class BatchResult:
 
 
 def fuse_batch(
-    where: str, version: int, blocks: Sequence[Block], rejected: Sequence[Rejected], executor: Executor, reporter: Reporter,
-    images: ImagesOf, innovation: float = REJECTED, check_points: NDArray[np.str_] | None = None, known: Snapshot | None = None,
+    where: str, version: int, batch: Sequence[Incoming], executor: Executor, reporter: Reporter, innovation: float = REJECTED,
+    check_points: NDArray[np.str_] | None = None, known: Snapshot | None = None,
 ) -> BatchResult:  # fmt: skip
-    """Fuse blocks that the ledger of a version has let through; ``rejected`` ones are entered in the ledger in the same commit.
+    """Fuse blocks that the ledger of a version does not refuse; those that cannot come in are entered in the ledger in the same commit.
 
-    ``images`` are those of the blocks, by block, as the network will have them. In the same commit go the ids of ``check_points``, where
-    blocks are fused. A block that contradicts that version as a whole is rejected when one of fewer than ``innovation`` good blocks would
-    (0: none is). ``known`` is that version where it is open already.
+    With the fused blocks go the ids of ``check_points``. A block that contradicts that version as a whole is rejected when one of fewer
+    than ``innovation`` good blocks would (0: none is). ``known`` is that version where it is open already.
 
     Raises
     ------
@@ -100,10 +97,11 @@ def fuse_batch(
         When another run has committed meanwhile; nothing of the batch is in the network then.
     """
     session, base = begin_change(where, version, known)
-    refused = list(rejected)
-    accepted, tests = _stage_one(blocks, images, base, executor, reporter, refused)
+    come, refused = _sorted_out(batch, base.metadata.ellipsoid, executor)
+    tests = _tests(come, base, executor, reporter)
     against = {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
-    blocks, move = _register([block for block in blocks if block.block_id in accepted], images, accepted, against, base, refused, executor)
+    come, move = _register(come, against, base, refused, executor)
+    blocks = [one.block for one in come]
     unsaid = _unsaid(refused, base)
     if not blocks and not unsaid:
         return BatchResult(base.number, (), tuple(refused), (), (), {}, (), ())  # the same command again writes nothing
@@ -144,34 +142,48 @@ def _unsaid(refused: Sequence[Rejected], base: Snapshot) -> list[Rejected]:
     return [r for r in refused if not ledger.said(r.block_id, r.reason)]
 
 
-def _stage_one(
-    blocks: Sequence[Block], images: ImagesOf, base: Snapshot, executor: Executor, reporter: Reporter, refused: list[Rejected]
-) -> tuple[dict[str, NDArray[np.bool_]], dict[str, BlockTest]]:
-    """Adjust each block of images by itself: the accepted rays of the blocks that succeed, and all of surveyed points.
+def _sorted_out(batch: Sequence[Incoming], ellipsoid: Ellipsoid, executor: Executor) -> tuple[list[Incoming], list[Rejected]]:
+    """The blocks of a batch that stage 1 has accepted, and the rejections of the others. Those that it has not seen are adjusted now.
 
-    Beside it the tests of blocks, also of rejected ones, that have points in common with the last version.
+    The workers of such a block were killed, its own one or that of others: each is adjusted with no other such block beside it.
     """
-    of_images = [block for block in blocks if block.kind == "images"]
-    groups = [of_images[k : k + BLOCKS_A_TASK] for k in range(0, len(of_images), BLOCKS_A_TASK)]
-    gates = _gates(groups, base)
-    arguments: Sequence[tuple[list[BlockRays], Ellipsoid, Gate | None]] = _OnDemand(
-        lambda k: ([block_rays(b, images[b.block_id]) for b in groups[k]], base.metadata.ellipsoid, gates[k]), len(groups)
-    )
-    outcomes = executor.attempt_all(adjust_blocks, arguments, "adjust", reporter.stage("adjusting blocks", len(arguments)))
-    for k, outcome in enumerate(outcomes):
-        if isinstance(outcome, KilledTaskError):
-            outcomes[k] = _one_at_a_time(arguments[k], executor)
-    accepted = {b.block_id: np.ones(len(b), dtype=np.bool_) for b in blocks if b.kind != "images"}
-    tests: dict[str, BlockTest] = {}
-    for outcome in (outcome for group in outcomes for outcome in group):
-        reason = outcome.reason or disagreement(outcome.accepted)
-        if reason is None and outcome.test is not None:
-            tests[outcome.block_id] = outcome.test
+    accepted, refused = [], []
+    for come in batch:
+        if come.reason is None and come.adjusted is None and come.block.kind == "images":
+            come = replace(come, adjusted=_adjusted_alone(BlockRays.of(come.block, come.images), ellipsoid, executor))
+        reason = come.reason or (None if come.adjusted is None else come.adjusted.reason)
         if reason is None:
-            accepted[outcome.block_id] = outcome.accepted
+            accepted.append(come)
         else:
-            refused.append(Rejected(outcome.block_id, reason))
-    return accepted, tests
+            refused.append(Rejected.of(come.block, reason))
+    return accepted, refused
+
+
+def _adjusted_alone(rays: BlockRays, ellipsoid: Ellipsoid, executor: Executor) -> BlockAdjustment:
+    (outcome,) = executor.attempt_all(adjust_blocks, [([rays], ellipsoid)], "adjust", lambda: None)
+    if isinstance(outcome, KilledTaskError):
+        reason = (
+            f"its adjustment killed {outcome.workers} workers, one after the other; give workers more memory, "
+            "or look into their logs for what crashes"
+        )
+        return BlockAdjustment(rays.block_id, np.zeros(len(rays.image), dtype=np.bool_), reason)
+    adjusted: BlockAdjustment = outcome[0]
+    return adjusted
+
+
+def _tests(batch: Sequence[Incoming], base: Snapshot, executor: Executor, reporter: Reporter) -> dict[str, BlockTest]:
+    """The tests of those blocks that have points in common with the last version."""
+    of_images = [come for come in batch if come.adjusted is not None]
+    cells = common_cells([come.block for come in of_images], base)
+    met = [(come, of_block) for come, of_block in zip(of_images, cells, strict=True) if of_block is not None]
+    groups = [met[k : k + BLOCKS_A_TASK] for k in range(0, len(met), BLOCKS_A_TASK)]
+    shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
+    arguments: Sequence[tuple[list[Candidate], Snapshot]] = _OnDemand(
+        lambda k: ([Candidate(come.rays, come.adjusted, of_block) for come, of_block in groups[k] if come.adjusted], shared), len(groups)
+    )
+    handles = executor.submit_all(tested, arguments, "test", reporter.stage("testing blocks", len(groups)))
+    found = chain.from_iterable(executor.results(handles))
+    return {come.block.block_id: test for (come, _), test in zip(met, found, strict=True) if test is not None}
 
 
 class _OnDemand(Sequence[T]):
@@ -192,73 +204,26 @@ class _OnDemand(Sequence[T]):
         return self._make(k)
 
 
-def _one_at_a_time(task: tuple[list[BlockRays], Ellipsoid, Gate | None], executor: Executor) -> list[BlockAdjustment]:
-    """Stage 1 of blocks whose task killed its workers, each with nothing beside it: what kills them then is that block."""
-    blocks, ellipsoid, gate = task
-    done = []
-    for k, block in enumerate(blocks):
-        alone = None if gate is None else Gate(gate.snapshot, gate.cells[k : k + 1])
-        (outcome,) = executor.attempt_all(adjust_blocks, [([block], ellipsoid, alone)], "adjust", lambda: None)
-        if isinstance(outcome, KilledTaskError):
-            reason = (
-                f"its adjustment killed {outcome.workers} workers, one after the other; give workers more memory, "
-                "or look into their logs for what crashes"
-            )
-            outcome = [BlockAdjustment(block.block_id, np.zeros(len(block.image), dtype=np.bool_), reason)]
-        done.extend(outcome)
-    return done
-
-
-def _gates(groups: Sequence[Sequence[Block]], base: Snapshot) -> list[Gate | None]:
-    """What the blocks of each group are tested by; None where the network has none of their points. The directory is read once."""
-    if not base.image_count() or not groups:
-        return [None] * len(groups)
-    shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
-    of_blocks = [block.points[0] for block in chain(*groups)]
-    cells = iter(np.split(base.candidate_cells(np.concatenate(of_blocks)), np.cumsum([len(ids) for ids in of_blocks])[:-1]))
-    of_groups = [tuple(next(cells) for _ in group) for group in groups]
-    return [Gate(shared, of_group) if any((cell >= 0).any() for cell in of_group) else None for of_group in of_groups]
-
-
 def _tested(test: BlockTest | None, version: int) -> tuple[float, int, float, int, int]:
     """The last columns of a block's line in the ledger."""
     return UNTESTED if test is None else (test.d2, test.dof, test.probability, test.left_out, version)
 
 
-def disagreement(accepted: NDArray[np.bool_]) -> str | None:
-    """Why a block whose rays contradict each other stays out: its points would be registered where they are not, against good blocks."""
-    if accepted.sum() >= LEAST_AGREEING * len(accepted):
-        return None
-    return (
-        f"only {accepted.sum()} of the block's {len(accepted)} rays agree with each other; "
-        "check the order of sample and line, the point ids and the cameras"
-    )
-
-
 def _register(
-    blocks: list[Block],
-    images: ImagesOf,
-    accepted: dict[str, NDArray[np.bool_]],
-    against: Mapping[str, str],
-    base: Snapshot,
-    refused: list[Rejected],
-    executor: Executor,
-) -> tuple[list[Block], Move]:
+    batch: list[Incoming], against: Mapping[str, str], base: Snapshot, refused: list[Rejected], executor: Executor
+) -> tuple[list[Incoming], Move]:
     """Register the rays of the batch; a block that measures a known point elsewhere, or nothing inside the area, is rejected.
 
     So are then those that contradict the network as a whole (``against``: reason by block): where one point tells more, it is said.
     """
     while True:
-        rays = _arriving(blocks, accepted, base.image_count())
-        move = place(
-            base, take_points(base, rays.ids), rays,
-            [image for block in blocks for image in images[block.block_id]], executor,
-        )  # fmt: skip
+        blocks, rays = [come.block for come in batch], _arriving(batch, base.image_count())
+        move = place(base, take_points(base, rays.ids), rays, [image for come in batch for image in come.images], executor)
         bad = _misplaced(blocks, rays, move) or {k: against[b.block_id] for k, b in enumerate(blocks) if b.block_id in against}
         if not bad:
-            return blocks, move
+            return batch, move
         refused.extend(Rejected.of(blocks[k], bad[k]) for k in sorted(bad))
-        blocks = [block for k, block in enumerate(blocks) if k not in bad]
+        batch = [come for k, come in enumerate(batch) if k not in bad]
 
 
 def _misplaced(blocks: Sequence[Block], arriving: LooseRays, move: Move) -> dict[int, str]:
@@ -298,19 +263,11 @@ def _registered_at(ids: NDArray[np.str_], move: Move) -> NDArray[np.float64]:
     return geocentric_to_geodetic(origin, move.cover.ellipsoid)[:, :2]
 
 
-def block_rays(block: Block, images: tuple[NetworkImage, ...] | None = None) -> BlockRays:
-    """A block of a catalogue as stage 1 sees it; ``images`` where they are known already, as the network will have them."""
-    return BlockRays(
-        block.block_id, network_images(block) if images is None else images, *block.points, block.image, block.observed, block.sigma
-    )
-
-
-def _arriving(blocks: Sequence[Block], accepted: dict[str, NDArray[np.bool_]], first_image: int) -> LooseRays:
-    starts = first_image + np.cumsum([0, *(len(b.images) for b in blocks)])
+def _arriving(batch: Sequence[Incoming], first_image: int) -> LooseRays:
+    starts = first_image + np.cumsum([0, *(len(come.images) for come in batch)])
     return together([
         LooseRays(
-            *b.points, (b.image + start).astype(np.int32), b.observed, b.sigma, accepted[b.block_id],
-            np.full(len(b), k, dtype=np.int32),
+            *b.points, (b.image + start).astype(np.int32), b.observed, b.sigma, come.accepted, np.full(len(b), k, dtype=np.int32),
         )
-        for k, (b, start) in enumerate(zip(blocks, starts, strict=False))
+        for k, (come, b, start) in enumerate(zip(batch, (come.block for come in batch), starts, strict=False))
     ])  # fmt: skip

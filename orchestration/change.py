@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from orchestration.executors import Executor
 from orchestration.progress import Reporter
-from orchestration.tasks import CellReport, FlaggedImage, TileReport, factor_tile, locate_part, update_tile
-from submin.adjustment.images import ImageSet
+from orchestration.tasks import Cameras, CellReport, FlaggedImage, TileReport, factor_tile, locate_part, update_tile
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.network.id_numbers import numbered
-from submin.network.network_image import NetworkImage, image_set
+from submin.network.network_image import NetworkImage
 from submin.network.registration import (
     LooseRays,
     Registration,
@@ -156,23 +155,24 @@ def place(base: Snapshot, out: TakenOut, arriving: LooseRays, new_images: Sequen
         first = base.image_count()
         old = np.unique(rays.image[rays.image < first]).astype(np.int32)
         rows = np.concatenate([old, np.arange(first, first + len(new_images), dtype=np.int32)])
-        images = image_set([*base.images(old), *new_images], base.metadata.ellipsoid, parameters)
-        registration = _registered(rays, images, rows, cover, executor)
+        cameras = Cameras([*base.images(old), *new_images], rows, base.metadata.ellipsoid, parameters)
+        registration = _registered(rays, cameras, cover, executor)
         full = [tile for tile in _touched_tiles(cover, out, registration) if _overfull(stored, cover, parameters, tile, out, registration)]
         if not full:
-            return Move(cover, parameters, out, registration, contradictions(rays, registration, images, rows, cover), tuple(new_images))
+            doubtful = cameras.seeing(rays.take(registration.doubtful(rays)))
+            return Move(cover, parameters, out, registration, contradictions(rays, registration, *doubtful, cover), tuple(new_images))
         for tile in full:
             if tile not in cover.splits:  # not yet, as the larger neighbour of another one
                 cover = cover.split(tile)
         out = _dissolve(base, cover, out)
 
 
-def _registered(rays: LooseRays, images: ImageSet, rows: Index, cover: Cover, executor: Executor) -> Registration:
+def _registered(rays: LooseRays, cameras: Cameras, cover: Cover, executor: Executor) -> Registration:
     """The points of some rays, a part of them a task: where a point goes depends on its own rays alone."""
     parts = by_points(rays, max(1, len(rays) // RAYS_A_TASK))
     if len(parts) == 1:
-        return register(rays, images, rows, cover)
-    known = executor.share((images, rows, replace(cover)))  # without what the cover has worked out: it travels
+        return register(rays, *cameras.seeing(rays), cover)
+    known = executor.share((cameras, replace(cover)))  # without what the cover has worked out: it travels
     handles = executor.submit_all(locate_part, [(rays.take(part), known) for part in parts], "register", lambda: None)
     return arranged(rays, joined(executor.results(handles), parts))
 

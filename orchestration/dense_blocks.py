@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestration.batch import block_rays, disagreement
-from orchestration.tasks import adjust_block
+from orchestration.stage_one import BlockRays, adjust_block
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.elimination import eliminate, linearise, point_factors
 from submin.adjustment.estimation import estimate_images
@@ -60,9 +59,9 @@ def free_points(block: Block, ellipsoid: Ellipsoid) -> Member:
     InputError
         With the reason for which the block cannot come in.
     """
-    raw = block_rays(block)
+    raw = BlockRays.of(block)
     outcome = adjust_block(raw, ellipsoid)
-    reason = outcome.reason or disagreement(outcome.accepted)
+    reason = outcome.reason
     if reason is not None:
         raise InputError(reason)
     images = image_set(raw.images, ellipsoid, width_of(image.sensor for image in raw.images))

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import zarr
 
-from orchestration.batch import Rejected, block_rays
+from orchestration.batch import Rejected
 from orchestration.control import ControlAdded, RejectedPoint
 from orchestration.dense_blocks import control_members, free_points
 from orchestration.memory import own_peak_memory_mb
 from orchestration.progress import Reporter, Silent
 from orchestration.run import DEFAULT_BATCH_BLOCKS, check_frames
+from orchestration.stage_one import BlockRays
 from orchestration.withdraw import Withdrawn
 from submin.errors import InputError, NumericalError
 from submin.network.network_image import NetworkImage
@@ -358,4 +359,4 @@ def _entry(arrival: Arrival, member: Member, version: int) -> Entry:
 
 
 def _images(blocks: Sequence[Block]) -> tuple[list[NetworkImage], list[ImageRecord]]:
-    return [image for block in blocks for image in block_rays(block).images], [image for block in blocks for image in block.images]
+    return [image for block in blocks for image in BlockRays.of(block).images], [image for block in blocks for image in block.images]

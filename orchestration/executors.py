@@ -25,6 +25,8 @@ SETTINGS = {
 }
 STREAMED = 4
 """Results of a stream that a worker may be ahead of whoever takes them."""
+BESIDE = -1
+"""Priority of a stream's tasks: what a worker does when it would wait."""
 Advance = Callable[[], None]
 T = TypeVar("T")
 
@@ -54,12 +56,12 @@ class Executor(Protocol):
 
     def stream(
         self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str, *, ahead: int | None = None,
-        past_kills: bool = False,
+        killed: Callable[..., Any] | None = None,
     ) -> Iterator[Any]:  # fmt: skip
         """The values of a function for tuples of arguments, in their order, a bounded number of them at a time: none is kept.
 
-        ``ahead`` bounds the number further. With ``past_kills`` a task whose workers were killed again and again is done here: it may
-        have waited on the worker of another one.
+        They are worked out where nothing else is to be done. ``ahead`` bounds the number further. Of a task whose workers were killed
+        again and again, or which waited on such a worker, the value is that of ``killed``, called here; without it that is an error.
         """
         ...
 
@@ -116,7 +118,7 @@ class SerialExecutor:
 
     def stream(
         self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str, *, ahead: int | None = None,
-        past_kills: bool = False,
+        killed: Callable[..., Any] | None = None,
     ) -> Iterator[Any]:  # fmt: skip
         """See `Executor.stream`."""
         return (recorded(name, function, *args) for args in arguments)
@@ -154,7 +156,7 @@ class ThreadExecutor(SerialExecutor):
 
         One task of much dense algebra is for `submit`, which leaves it all cores.
         """
-        with self._libraries.limit(limits=1, user_api="blas"), ThreadPoolExecutor(self._threads, thread_name_prefix=name) as pool:
+        with self._libraries.limit(limits=1, user_api="blas"), self._pool(name) as pool:
             handles = [pool.submit(recorded, name, function, *args) for args in arguments]
             try:
                 done = []
@@ -165,6 +167,28 @@ class ThreadExecutor(SerialExecutor):
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
             return done
+
+    def stream(
+        self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str, *, ahead: int | None = None,
+        killed: Callable[..., Any] | None = None,
+    ) -> Iterator[Any]:  # fmt: skip
+        """See `Executor.stream`."""
+        most = min(STREAMED * self._threads, ahead or STREAMED * self._threads)
+        waiting: deque[Any] = deque()
+        with self._pool(name) as pool:
+            try:
+                for args in arguments:
+                    waiting.append(pool.submit(recorded, name, function, *args))
+                    if len(waiting) == most:
+                        yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+    def _pool(self, name: str) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self._threads, thread_name_prefix=name)
 
 
 class DaskExecutor:
@@ -179,6 +203,7 @@ class DaskExecutor:
         self._deserted, self.beside = deserted, deserted is not None
         self.workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
         self._address = client.scheduler.address
+        self._streams = 0
 
     def share(self, value: Any) -> Any:
         """See `Executor.share`. A task, since scattered values are gone for good with the workers that hold them."""
@@ -204,6 +229,7 @@ class DaskExecutor:
 
         waiting = iter(range(len(arguments)))
         handles: list[Any] = [None] * len(arguments)
+        again: set[int] = set()
 
         def submit_next() -> Any:
             k = next(waiting, None)
@@ -218,7 +244,14 @@ class DaskExecutor:
             first = [f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None]
             running: Any = as_completed(first)
             for future in running:
-                if future.status != "finished" and not (past_kills and isinstance(future.exception(), KilledWorker)):
+                killed = future.status != "finished" and isinstance(future.exception(), KilledWorker)
+                if killed and self._streams and (k := handles.index(future)) not in again:
+                    # a task of the stream on the same worker may be to blame, which has then had its last try, too
+                    again.add(k)
+                    handles[k] = self._start(function, arguments[k], name)
+                    running.add(handles[k])
+                    continue
+                if future.status != "finished" and not (past_kills and killed):
                     future.result()  # raises the task's error here
                 advance()
                 following = submit_next()
@@ -231,8 +264,9 @@ class DaskExecutor:
         with self._losses_said():
             return self._start(function, arguments, name)
 
-    def _start(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
-        return self.client.submit(recorded, name, function, *arguments, pure=False, key=f"{name}-{os.urandom(6).hex()}")
+    def _start(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str, priority: int = 0) -> Any:
+        key = f"{name}-{os.urandom(6).hex()}"
+        return self.client.submit(recorded, name, function, *arguments, pure=False, key=key, priority=priority)
 
     def wait(self, handles: Sequence[Any], advance: Advance) -> None:
         """See `Executor.wait`."""
@@ -247,7 +281,7 @@ class DaskExecutor:
 
     def stream(
         self, function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], name: str, *, ahead: int | None = None,
-        past_kills: bool = False,
+        killed: Callable[..., Any] | None = None,
     ) -> Iterator[Any]:  # fmt: skip
         """See `Executor.stream`."""
         from distributed import KilledWorker
@@ -256,20 +290,28 @@ class DaskExecutor:
             try:
                 return handle.result()
             except KilledWorker:
-                if not past_kills:
+                if killed is None:
                     raise
-                return recorded(name, function, *args)
+                return recorded(name, killed, *args)
 
         most = min(STREAMED * self.workers, ahead or STREAMED * self.workers)
         waiting: deque[tuple[Any, tuple[Any, ...]]] = deque()
-        with self._losses_said():
+        with self._losses_said(), self._streaming():
             for args in arguments:
-                waiting.append((self._start(function, args, name), args))
+                waiting.append((self._start(function, args, name, priority=BESIDE), args))
                 self._check_scheduler()
                 if len(waiting) == most:
                     yield value(*waiting.popleft())
             while waiting:
                 yield value(*waiting.popleft())
+
+    @contextmanager
+    def _streaming(self) -> Iterator[None]:
+        self._streams += 1
+        try:
+            yield
+        finally:
+            self._streams -= 1
 
     def _attempt(self, handle: Any) -> Any:
         try:

@@ -17,6 +17,10 @@ class Reporter(Protocol):
         """A run of so many blocks begins."""
         ...
 
+    def read(self, blocks: int) -> None:
+        """So many more blocks have been read, and adjusted by themselves: ahead of those that are being fused, from another thread."""
+        ...
+
     def stage(self, name: str, total: int) -> Callable[[], None]:
         """A stage of so many steps begins; the answer is to be called after each step."""
         ...
@@ -32,6 +36,9 @@ class Silent:
     def begin(self, blocks: int) -> None:
         """See `Reporter.begin`."""
 
+    def read(self, blocks: int) -> None:
+        """See `Reporter.read`."""
+
     def stage(self, name: str, total: int) -> Callable[[], None]:
         """See `Reporter.stage`."""
         return lambda: None
@@ -41,16 +48,22 @@ class Silent:
 
 
 class Bars:
-    """One bar for the blocks of the run, one for the stage of the batch."""
+    """One bar for the blocks that are read and adjusted, one for the stage of the batch, and one for the blocks that are fused."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
+        self._read = progress.add_task("adjusting blocks", total=None, visible=False)
         self._stage = progress.add_task("", total=None, visible=False)
-        self._blocks = progress.add_task("blocks", total=None, visible=False)
+        self._blocks = progress.add_task("blocks fused", total=None, visible=False)
 
     def begin(self, blocks: int) -> None:
         """See `Reporter.begin`."""
-        self._progress.update(self._blocks, total=blocks, completed=0, visible=True)
+        for bar in (self._read, self._blocks):
+            self._progress.update(bar, total=blocks, completed=0, visible=True)
+
+    def read(self, blocks: int) -> None:
+        """See `Reporter.read`."""
+        self._progress.advance(self._read, blocks)
 
     def stage(self, name: str, total: int) -> Callable[[], None]:
         """See `Reporter.stage`."""

@@ -26,7 +26,7 @@ from submin.network.innovation import REJECTED
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, observed_positions, points_of
-from submin.storage.ledger import Ledger
+from submin.storage.ledger import Ledger, blocks_in
 from submin.storage.network_store import Snapshot
 from submin.storage.writer_lock import writing
 
@@ -149,14 +149,17 @@ def run(
         When another process is writing to the network.
     """
     started, reporter = time.monotonic(), reporter or Silent()
-    check_frames(catalogue, Snapshot.open(place))
+    before = Snapshot.open(place)
+    check_frames(catalogue, before)
+    here = blocks_in(before)
+    del before
     validated = _validation(catalogue, executor)
     control = catalogue.points("control")
     observed = observation_blocks(catalogue)
     clusters = sum(1 for _ in catalogue.observations())
     reporter.begin(catalogue.block_count + (0 if control is None else len(control)) + clusters)
     surveyed = () if control is None else control_blocks(control, catalogue.metadata.ellipsoid, f"{catalogue.path}/control")
-    every = chain(read_catalogue(catalogue, executor, batch_blocks), ready(chain(surveyed, observed)))
+    every = chain(read_catalogue(catalogue, executor, batch_blocks, here), ready(chain(surveyed, observed)))
     check = catalogue.points("check")
     tally = fuse_blocks(
         every, place, executor, batch_blocks, reporter, innovation, np.empty(0, dtype="U1") if check is None else check.point_ids, validated
@@ -225,11 +228,8 @@ def fuse_blocks(
         for number, batch in enumerate(_once(validated, batches_ahead(new, max(batch_blocks, 1)))):
             if number:
                 executor.give_back()
-            good = [come.block for come in batch if come.reason is None]
-            refused = [Rejected.of(come.block, come.reason) for come in batch if come.reason is not None]
-            images = {come.block.block_id: come.images for come in batch if come.reason is None}
             directory.result()
-            tally.add(fuse_batch(place, tally.version, good, refused, executor, reporter, images, innovation, check_points, known))
+            tally.add(fuse_batch(place, tally.version, batch, executor, reporter, innovation, check_points, known))
             known = None  # with all that it has read
             reporter.fused(len(batch))
     return tally
@@ -262,6 +262,7 @@ def _result(after: Snapshot, tally: Tally, started: float, executor: Executor) -
 def _new_blocks(blocks: Iterable[Incoming], ledger: Ledger, tally: Tally, reporter: Reporter) -> Iterator[Incoming]:
     """Blocks that the network does not have."""
     for come in blocks:
+        reporter.read(1)
         if ledger.holds(come.block):
             tally.skipped += come.block.kind == "images"
             reporter.fused(1)

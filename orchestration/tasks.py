@@ -1,4 +1,4 @@
-"""What workers do: pure functions of their arguments and of one version of the network, safe to run again after a loss.
+"""What workers do in stage 2: pure functions of their arguments and of one version of the network, safe to run again after a loss.
 
 They live in an importable module, so that Dask sends their names and not their code.
 """
@@ -15,51 +15,19 @@ from numpy.typing import NDArray
 
 from submin.adjustment.adjustment import Adjustment, adjust
 from submin.adjustment.images import ImageSet
-from submin.adjustment.intersection import blind_image, intersect
-from submin.adjustment.rays import Rays, canonical_order
-from submin.adjustment.status import Cause, Status
 from submin.adjustment.surveyed_points import ContradictedPoint, contradicted_points
-from submin.errors import NumericalError, SubminError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell, RegisteredPoints, bundle, loses, summed, union_of_images, with_points, without_points
-from submin.network.innovation import BlockTest
 from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import Located, LooseRays, locate
-from submin.network.sub_min import SubMin, add_sums, factor
-from submin.query.block_innovation import block_test, common_points
+from submin.network.sub_min import add_sums, factor
 from submin.sensors import sensor_named, width_of
-from submin.storage.network import Network
 from submin.storage.network_store import Snapshot
 from submin.storage.schema import write_cell, write_sub_min
 from submin.tiling.cover import Cover
 
 LEAST_STATISTIC = 3.0
 """An image found to be bad with less has lost most of its rays instead."""
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class BlockRays:
-    """A block as stage 1 sees it: its images, the ids of its points (ascending), and its rays by point and image."""
-
-    block_id: str
-    images: tuple[NetworkImage, ...]
-    ids: NDArray[np.str_]
-    point: NDArray[np.int32]
-    image: NDArray[np.int32]
-    observed: Array
-    sigma: Array
-
-
-@dataclass(frozen=True)
-class BlockAdjustment:
-    """Stage 1 of one block: which rays (in the block's order) are accepted, or why the whole block is not; and its test by the network."""
-
-    block_id: str
-    accepted: Flags
-    reason: str | None
-    test: BlockTest | None = None
 
 
 @dataclass(frozen=True)
@@ -117,111 +85,24 @@ class TileFactored:
 
 
 @dataclass(frozen=True)
-class Gate:
-    """The version of the network by which blocks are tested, and the cell (n,) of each of a block's n points (ids ascending) in it."""
+class Cameras:
+    """Images (m,) by which points are registered, and their rows (m,) of the network, ascending; ``parameters`` are kept for each."""
 
-    snapshot: Snapshot
-    cells: tuple[NDArray[np.int64], ...]
+    images: Sequence[NetworkImage]
+    rows: NDArray[np.int32]
+    ellipsoid: Ellipsoid
+    parameters: int
 
-
-def adjust_blocks(blocks: Sequence[BlockRays], ellipsoid: Ellipsoid, gate: Gate | None = None) -> list[BlockAdjustment]:
-    """Stage 1: adjust each block by itself, free of the network, reject its blunders; a block that fails gets its reason.
-
-    With a gate each block that succeeds is then tested against what the network says of their common points.
-    """
-    if gate is None:
-        return [adjust_block(block, ellipsoid) for block in blocks]
-    network = BlockGate(gate)
-    return [adjust_block(block, ellipsoid, network, cells) for block, cells in zip(blocks, gate.cells, strict=True)]
+    def seeing(self, rays: LooseRays) -> tuple[ImageSet, NDArray[np.int32]]:
+        """Those that some rays have, and their rows."""
+        seen = np.flatnonzero(np.bincount(np.searchsorted(self.rows, rays.image), minlength=len(self.rows)))
+        return image_set([self.images[k] for k in seen.tolist()], self.ellipsoid, self.parameters), self.rows[seen]
 
 
-def adjust_block(
-    block: BlockRays, ellipsoid: Ellipsoid, gate: BlockGate | None = None, cells: NDArray[np.int64] | None = None
-) -> BlockAdjustment:
-    """Stage 1 of one block, and its test by the network where there is a gate (``cells`` as in `Gate`)."""
-    accepted = np.ones(len(block.image), dtype=np.bool_)
-    try:
-        images = image_set(block.images, ellipsoid, width_of(image.sensor for image in block.images))
-        ids, point = block.ids, block.point
-        order = canonical_order(point, block.image, block.observed)
-        rays = Rays(point[order], block.image[order], block.observed[order], block.sigma[order], accepted)
-        start = intersect(images, rays, len(ids))
-        lost = np.flatnonzero(~np.isfinite(start).all(axis=1))
-        blind = (int(rays.image[np.searchsorted(rays.point, lost[0])]), int(lost[0])) if len(lost) else blind_image(images, rays)
-        if blind is not None:
-            return BlockAdjustment(block.block_id, accepted, Status(Cause.UNSEEN, False, 0, *blind).message(images.ids, ids))
-        if np.bincount(rays.point).max() < 2:
-            return BlockAdjustment(block.block_id, accepted, None)
-        result = adjust(images, rays, start)
-        if result.status.cause not in (Cause.CONVERGED, Cause.FEW_AGREE):  # that few agree is told from the rays, settled or not
-            return BlockAdjustment(block.block_id, accepted, result.status.message(images.ids, ids))
-        accepted = np.empty(len(accepted), dtype=np.bool_)
-        accepted[order] = result.accepted
-        test = None if gate is None or cells is None else gate.test(block.images, ids, cells, rays, result, start)
-        return BlockAdjustment(block.block_id, accepted, None, test)
-    except SubminError as error:
-        return BlockAdjustment(block.block_id, accepted, str(error))
-
-
-class BlockGate:
-    """Tests blocks by one version of a network; what several blocks ask for is read once."""
-
-    def __init__(self, gate: Gate) -> None:
-        self._snapshot = gate.snapshot
-        self._cells = np.unique(np.concatenate(gate.cells))
-        self._networks: dict[int, Network] = {}
-        self._passes: NDArray[np.str_] | None = None
-        self._tile_images: dict[int, NDArray[np.int32]] = {}
-        self._latest: tuple[tuple[int, int], SubMin] | None = None
-
-    def _sub_min(self, parameters: int, tile: int) -> SubMin:
-        """A tile's sub-MIN; the latest one is kept, since neighbouring blocks ask for the same."""
-        if self._latest is None or self._latest[0] != (parameters, tile):
-            self._latest = None  # never two in memory
-            self._latest = (parameters, tile), self._network(parameters).sub_min(tile, None)
-        return self._latest[1]
-
-    def _network(self, parameters: int) -> Network:
-        """The network with so many parameters an image; the images of all cells that are asked for are read at once."""
-        if parameters not in self._networks:
-            base = self._snapshot
-            network = Network.over(Snapshot(base.root, base.place, base.cover, parameters))
-            network.image_set(union_of_images([network.cell(int(number)) for number in self._cells[self._cells >= 0]]))
-            self._networks[parameters] = network
-        return self._networks[parameters]
-
-    def test(
-        self, block: Sequence[NetworkImage], ids: NDArray[np.str_], cells: NDArray[np.int64], rays: Rays, adjusted: Adjustment, start: Array
-    ) -> BlockTest | None:
-        """Test a block whose stage 1 is done; None where nothing can be compared."""
-        if not (cells >= 0).any():
-            return None
-        base = self._snapshot
-        p = max(base.metadata.parameters, width_of(image.sensor for image in block))
-        images = image_set(block, base.metadata.ellipsoid, p)
-        theta = np.zeros((len(images), p))
-        theta[:, : adjusted.theta.shape[1]] = adjusted.theta
-        try:
-            common = common_points(
-                self._network(p), ids, cells, images, lambda tile: self._mates(tile, block), lambda tile: self._sub_min(p, tile)
-            )
-            return None if common is None else block_test(common, images, ids, rays, replace(adjusted, theta=theta), start)
-        except NumericalError:  # what cannot be computed is no reason against the block
-            return None
-
-    def _mates(self, tile: int, block: Sequence[NetworkImage]) -> NDArray[np.int32]:
-        """Rows of the tile's images that share a pass with an image of a block."""
-        if self._passes is None:
-            self._passes = self._snapshot.image_columns(["pass_id"])["pass_id"]
-        if tile not in self._tile_images:
-            self._tile_images[tile] = self._snapshot.tile_images(tile)
-        rows = self._tile_images[tile]
-        return rows[np.isin(self._passes[rows], [image.pass_id for image in block])]
-
-
-def locate_part(rays: LooseRays, known: tuple[ImageSet, NDArray[np.int32], Cover]) -> Located:
-    """`locate` with images, their rows and a cover that all parts of the rays share."""
-    return locate(rays, *known)
+def locate_part(rays: LooseRays, known: tuple[Cameras, Cover]) -> Located:
+    """`locate` with cameras and a cover that all parts of the rays share."""
+    cameras, cover = known
+    return locate(rays, *cameras.seeing(rays), cover)
 
 
 def update_tile(

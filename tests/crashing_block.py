@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from orchestration import tasks
+from orchestration import reading, stage_one
 
 CRASHES = "TEST_BLOCK_THAT_CRASHES"
 """Environment variable with the block's id."""
 
 
 def dask_setup(worker: Any) -> None:
-    adjust_block = tasks.adjust_block
+    adjust_block = stage_one.adjust_block
 
-    def crashing(block: tasks.BlockRays, *rest: Any) -> tasks.BlockAdjustment:
+    def crashing(block: stage_one.BlockRays, *rest: Any) -> stage_one.BlockAdjustment:
         if block.block_id == os.environ[CRASHES]:
             os.abort()
         return adjust_block(block, *rest)
 
-    tasks.adjust_block = crashing
+    stage_one.adjust_block = reading.adjust_block = crashing

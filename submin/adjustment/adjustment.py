@@ -77,6 +77,26 @@ RISE = 1e-6
 
 
 @dataclass(frozen=True)
+class BundleEstimate:
+    """Where an adjustment has put cameras and points.
+
+    Attributes
+    ----------
+    theta : (m, p) corrections of the images; ground : (n, 3) geocentric positions, metres; released : (m,), all as in `Adjustment`
+    """
+
+    theta: Array
+    ground: Array
+    released: NDArray[np.bool_]
+
+    def widened(self, parameters: int) -> BundleEstimate:
+        """The same with zeros for parameters up to so many an image."""
+        theta = np.zeros((len(self.theta), parameters))
+        theta[:, : self.theta.shape[1]] = self.theta
+        return BundleEstimate(theta, self.ground, self.released)
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """Result of adjusting a bundle of rays.
 
@@ -101,6 +121,11 @@ class Adjustment:
     image_statistic: Array
     residuals: Array
     status: Status
+
+    @property
+    def estimate(self) -> BundleEstimate:
+        """Where cameras and points are."""
+        return BundleEstimate(self.theta, self.ground, self.released)
 
     @property
     def converged(self) -> bool:

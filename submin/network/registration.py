@@ -123,6 +123,10 @@ class Registration:
     counts: Flags
     outside: Flags
 
+    def doubtful(self, rays: LooseRays) -> Flags:
+        """(r,) True for those of the registered rays, all of them, which count and whose point may be two places."""
+        return np.asarray(self.counts & (self.apart > SAME_POINT_METRES)[rays.point])
+
 
 @dataclass(frozen=True)
 class Located:
@@ -180,24 +184,29 @@ def arranged(rays: LooseRays, located: Located) -> Registration:
     """Rays by the cells in which their points are registered."""
     ids, point, at = rays.ids, rays.point, located.cell
     cells, place = np.unique(at, return_inverse=True)
-    place = place[point]
-    order = np.argsort(place * len(point) + np.arange(len(point)))  # rays by cell: one pass however many cells
-    start = np.cumsum([0, *np.bincount(place, minlength=len(cells))])
-    arrivals: dict[int, RegisteredPoints] = {}
-    for k, number in enumerate(cells.tolist()):
-        if number >= 0:
-            rows = order[start[k] : start[k + 1]]
-            members, row = np.unique(point[rows], return_inverse=True)
-            arrivals[number] = RegisteredPoints(
-                ids[members], located.origin[members], row.astype(np.int32), rays.image[rows], rays.observed[rows], rays.sigma[rows]
-            )
+    of_points, of_rays = _by_group(place, len(cells)), _by_group(place[point], len(cells))
+    row = np.empty(len(ids), dtype=np.int32)  # of each point in its cell
+    for members in of_points:
+        row[members] = np.arange(len(members), dtype=np.int32)
+    arrivals = {
+        number: RegisteredPoints(
+            ids[members], located.origin[members], row[point[rows]], rays.image[rows], rays.observed[rows], rays.sigma[rows]
+        )
+        for number, members, rows in zip(cells.tolist(), of_points, of_rays, strict=True)
+        if number >= 0
+    }
     return Registration(arrivals, (ids, at), located.apart, located.counts, located.outside[point])
+
+
+def _by_group(group: NDArray[np.integer], groups: int) -> list[NDArray[np.int64]]:
+    """Rows, ascending, of each of so many groups."""
+    few = group.astype(np.uint16) if groups <= 1 << 16 else group  # small numbers are sorted by their digits, in one pass
+    return np.split(np.argsort(few, kind="stable"), np.cumsum(np.bincount(group, minlength=groups))[:-1])[:groups]
 
 
 def by_points(rays: LooseRays, parts: int) -> list[NDArray[np.int64]]:
     """Rows of some rays in so many parts, each with all rays of its points: parts can be located apart, see `joined`."""
-    part = (rays.point.astype(np.int64) * parts // max(len(rays.ids), 1)).astype(np.uint16)
-    return np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part, minlength=parts))[:-1])
+    return _by_group(rays.point.astype(np.int64) * parts // max(len(rays.ids), 1), parts)
 
 
 def joined(parts: Sequence[Located], rows: Sequence[NDArray[np.int64]]) -> Located:
@@ -229,7 +238,7 @@ def contradictions(
     Blocks are taken in their order, and one that contradicts is left out for those after it: the same as one at a time. Only rays that
     count do (see `Registration`). Arguments as of `register`, and its result.
     """
-    doubtful = rays.take(registration.counts & (registration.apart > SAME_POINT_METRES)[rays.point])
+    doubtful = rays.take(registration.doubtful(rays))
     most = _most_apart(doubtful, images, image_rows)
     kept = doubtful.block == IN_THE_NETWORK
     found: dict[int, tuple[str, float]] = {}

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from submin.adjustment.adjustment import Adjustment
+from submin.adjustment.adjustment import BundleEstimate
 from submin.adjustment.control import ControlledPrior, covariance_factor, innovation_of
 from submin.adjustment.controlled_adjustment import adjust_controlled
 from submin.adjustment.elimination import linearise
@@ -120,15 +120,14 @@ def _tile_of_most(source: NetworkSource, selections: Sequence[Selection]) -> int
     return max(sorted(held), key=lambda tile: (held[tile], owned[tile]), default=None)
 
 
-def block_test(common: CommonPoints, images: ImageSet, ids: Ids, rays: Rays, adjusted: Adjustment, start: Array) -> BlockTest | None:
+def block_test(common: CommonPoints, images: ImageSet, ids: Ids, rays: Rays, adjusted: BundleEstimate, start: Array) -> BlockTest | None:
     """Test a block, adjusted by itself, against what a network says of their common points; None when nothing can be compared.
 
     Parameters
     ----------
-    images, rays : of the block; ids : (n,) its points, ascending; start : (n, 3) where they were registered
-    adjusted : stage 1 of the block
+    images : of the block; ids : (n,) its points, ascending; start : (n, 3) where they were registered
+    rays : of the block, with what its own adjustment has accepted, which has put its cameras and points where ``adjusted`` says
     """
-    rays = rays.with_accepted(adjusted.accepted)
     released = images.release(adjusted.released)
     scale = max(common.state.chi_square / common.state.redundancy, 1.0) if common.state.redundancy > 0 else 1.0
     k, m = len(common.ids), len(images)

@@ -104,9 +104,12 @@ class ImageRows(Sequence[ImageRecord]):
 
     def take(self, rows: Sequence[int] | NDArray[np.int64]) -> tuple[ImageRecord, ...]:
         """The images at some places."""
-        values = self._columns.take(pa.array(rows, pa.int64())).to_pydict()
         if not len(rows):
             return ()
+        first, last = int(rows[0]), int(rows[-1])
+        neighbours = last - first == len(rows) - 1 and all(row == first + k for k, row in enumerate(rows))
+        # what lies side by side, as the images of a block do nearly always, is not gathered
+        values = (self._columns.slice(first, len(rows)) if neighbours else self._columns.take(pa.array(rows, pa.int64()))).to_pydict()
         texts = [self._long(row) for row in rows]
         return tuple(
             ImageRecord(**dict(zip(values, of_image, strict=True)), camera=camera, footprint=footprint)

@@ -61,6 +61,13 @@ def append_entries(ledger: zarr.Group, entries: Sequence[Entry]) -> None:
         append_table(ledger, {f.name: np.array(values) for f, values in zip(fields(Entry), columns, strict=True)})
 
 
+def blocks_in(snapshot: Snapshot) -> frozenset[str]:
+    """Ids of the blocks that are in a version, without the rest of its ledger."""
+    lines = snapshot.ledger(["block_id", "status"])
+    last = {block: status for block, status in zip(*(c.tolist() for c in lines.values()), strict=True) if status != "rejected"}
+    return frozenset(block for block, status in last.items() if status == "fused")
+
+
 class Ledger:
     """What a version of a network holds, and what a run has added to it since.
 

@@ -14,10 +14,10 @@ import pytest
 from networks import area_of, fuse, rewrite, same_network
 
 import submin
-from orchestration.batch import block_rays
 from orchestration.cli import main
 from orchestration.executors import SerialExecutor, executor_for
 from orchestration.run import RunResult, run
+from orchestration.stage_one import BlockRays
 from orchestration.withdraw import withdraw
 from submin.adjustment.control import ControlledPrior
 from submin.network.network_image import image_set
@@ -75,7 +75,7 @@ def come(catalogue: Path, network: Path, folder: Path, block: Block, **options: 
 
 def test_what_the_tile_knows_of_the_block_is_that_of_the_joined_network(others: Path, blocks: list[Block]) -> None:
     """From stored covariances, against the tile factored again with the block's images joined to it."""
-    block = block_rays(blocks[LAST])
+    block = BlockRays.of(blocks[LAST])
     network = submin.open(others)
     ids = block.ids
     cells = network.snapshot.candidate_cells(ids)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from orchestration.batch import block_rays
+from orchestration.stage_one import BlockRays
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.control import correlated, estimate, innovation_of, innovation_test
 from submin.adjustment.elimination import linearise
@@ -94,7 +94,7 @@ def test_by_rays_or_by_covariances_it_is_the_same_number() -> None:
     sigma = np.column_stack([region.sigma_sample, region.sigma_line])
     priors = {image.block_id: region.design.priors for image in region.images}
     block = _blocks(region.images, priors, region.point_ids[region.point], region.image, observed, sigma)[0]
-    of_block = block_rays(block)
+    of_block = BlockRays.of(block)
     images = image_set(of_block.images, WGS84, 6)
     ids, point = of_block.ids, of_block.point
     rays = sorted_rays(point.astype(np.int32), of_block.image, of_block.observed, of_block.sigma, np.ones(len(point), dtype=np.bool_))
