@@ -9,6 +9,7 @@ import time
 import tracemalloc
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,11 @@ def kill_the_worker(value: int) -> int:
 
 def kill_for_three(value: int) -> int:
     return kill_the_worker(value) if value == 3 else double(value)
+
+
+def kill_after_a_nap(value: int) -> int:
+    time.sleep(0.5)
+    return kill_the_worker(value)
 
 
 def kill_for_two(value: int) -> int:
@@ -254,6 +260,19 @@ def test_a_stream_goes_on_past_killed_workers() -> None:
         assert list(values) == [0, 2, 4, 6, 8, 10]
         with pytest.raises(KilledTaskError, match=r"2 workers that ran the same task \(stream\)"):
             list(executor.stream(kill_the_worker, [(1,)], "stream"))
+
+
+def test_tasks_beside_a_stream_that_kills_their_worker_are_done() -> None:
+    """They wait on the worker that a task of the stream kills until it is given up, are blamed as often, and get another start."""
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}), executor_for(1) as executor:
+        values = executor.stream(kill_after_a_nap, ((k,) for k in range(2)), "stream", killed=double)
+        with ThreadPoolExecutor(1) as beside:
+            first = beside.submit(next, values)
+            time.sleep(0.1)  # the stream's task runs when the others come
+            handles = executor.submit_all(double, [(k,) for k in range(3)], "beside", lambda: None)
+            assert executor.results(handles) == [0, 2, 4]
+            assert first.result() == 0
+        assert list(values) == [2]
 
 
 def test_a_local_cluster_needs_no_network(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,9 +15,12 @@ import pyarrow.parquet as pq
 import pytest
 from networks import area_of, fuse, rewrite
 
-from orchestration.executors import Executor, SerialExecutor, executor_for
+from orchestration import reading
+from orchestration.executors import Executor, SerialExecutor, ThreadExecutor, executor_for
 from orchestration.reading import BLOCKS_TOGETHER, Incoming, read_catalogue, ready
+from orchestration.stage_one import BlockAdjustment, BlockRays, adjust_block
 from submin.errors import CatalogueError
+from submin.geodesy import Ellipsoid
 from submin.simulation.region import SimulatedRegion
 from submin.storage.block_images import network_images
 from submin.storage.catalogue import Catalogue
@@ -95,6 +98,54 @@ def test_any_table_that_the_coordinator_can_read_will_do(many: Catalogue, worker
 def test_workers_leave_little_to_do(many: Catalogue, worker: Executor) -> None:
     """Numbers of points and hash travel with a block."""
     assert all({"points", "_content_hash"} <= set(vars(come.block)) for come in read_catalogue(many, worker, 2000))
+
+
+def test_stage_one_goes_with_the_reading(many: Catalogue, worker: Executor) -> None:
+    """But for what cannot come in, and what is in the network already."""
+    here = {many.block_ids[1], many.block_ids[-1]}
+    alone = {block.block_id: adjust_block(BlockRays.of(block), many.metadata.ellipsoid) for block in many.blocks() if not defects(block)}
+    for executor in (SerialExecutor(), ThreadExecutor(2), worker):
+        for come in read_catalogue(many, executor, 2000, here):
+            if come.reason is not None or come.block.block_id in here:
+                assert come.adjusted is None
+                continue
+            found, expected = come.adjusted, alone[come.block.block_id]
+            assert found is not None and found.reason is None
+            assert np.array_equal(found.accepted, expected.accepted) and np.array_equal(come.accepted, expected.accepted)
+            assert found.estimate is not None and expected.estimate is not None
+            assert np.array_equal(found.estimate.theta, expected.estimate.theta)
+            assert np.array_equal(found.estimate.ground, expected.estimate.ground)
+
+
+def test_what_the_network_has_is_not_adjusted_again(
+    region: SimulatedRegion, catalogue: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    network = tmp_path / "network"
+    blocks = list(Catalogue.open(catalogue).blocks())
+    fuse(rewrite(catalogue, tmp_path / "first", blocks[:3]), network, area_of(region))
+    seen = []
+
+    def adjusted(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
+        seen.append(block.block_id)
+        return adjust_block(block, ellipsoid)
+
+    monkeypatch.setattr(reading, "adjust_block", adjusted)
+    again = fuse(rewrite(catalogue, tmp_path / "more", blocks[:4]), network, area_of(region))
+    assert (again.fused, again.skipped, seen) == (1, 3, [blocks[3].block_id])
+
+
+def test_a_block_travels_without_the_names_of_its_rays(many: Catalogue) -> None:
+    """Those of its points tell them; a block whose points are not numbered keeps them."""
+    block = next(many.blocks())
+    plain, names = len(pickle.dumps(block)), block.point_ids.copy()
+    again = pickle.loads(pickle.dumps(block))
+    assert "points" not in vars(block) and same(again, block)
+    numbered = pickle.loads(pickle.dumps(block))
+    assert "point_ids" not in vars(numbered) and np.array_equal(numbered.point_ids, names)
+    assert len(pickle.dumps(numbered)) < plain
+    assert same(replace(numbered, block_id=block.block_id), block)
+    with pytest.raises(AttributeError, match="no attribute 'names'"):
+        _ = numbered.names
 
 
 def test_only_the_rows_of_the_block_are_sent(many: Catalogue) -> None:
