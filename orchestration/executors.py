@@ -244,7 +244,7 @@ class DaskExecutor:
             first = [f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None]
             running: Any = as_completed(first)
             for future in running:
-                killed = future.status != "finished" and isinstance(future.exception(), KilledWorker)
+                killed = future.status == "error" and isinstance(future.exception(), KilledWorker)
                 if killed and self._streams and (k := handles.index(future)) not in again:
                     # a task of the stream on the same worker may be to blame, which has then had its last try, too
                     again.add(k)
