@@ -323,7 +323,7 @@ def append_table(group: zarr.Group, columns: Mapping[str, AnyArray]) -> None:
 
 async def _append(array: zarr.AsyncArray[Any], values: AnyArray) -> None:
     with sound_chunks(array.path):  # the last chunk is read, and written with more in it
-        await array.append(values)
+        await array.with_config(WRITTEN_WHOLE).append(values)
 
 
 def read_table(group: zarr.Group, wanted: Iterable[str] | None = None, start: int = 0, stop: int | None = None) -> dict[str, AnyArray]:
