@@ -124,9 +124,27 @@ def test_batches_come_in_order_one_ahead_and_errors_where_they_are() -> None:
     assert list(batches_ahead([], 2)) == []
 
 
+def test_whoever_stops_reading_does_not_wait_for_the_next_batch() -> None:
+    taken: list[int] = []
+
+    def values() -> Iterator[int]:
+        for k in range(1000):
+            taken.append(k)
+            time.sleep(0.05 * (k >= 500))
+            yield k
+
+    def first_batch_only() -> None:
+        for _ in batches_ahead(values(), 500):  # another one takes 25 s
+            raise InputError("stopped")
+
+    with pytest.raises(InputError, match="stopped"):
+        first_batch_only()
+    assert len(taken) < 510
+
+
 def test_a_stream_comes_in_order_and_is_bounded(cluster: LocalCluster) -> None:
     with Client(cluster) as client:
-        for executor, most in ((SerialExecutor(), 1), (DaskExecutor(client), STREAMED * 2)):
+        for executor, most in ((SerialExecutor(), 1), (ThreadExecutor(2), STREAMED * 2), (DaskExecutor(client), STREAMED * 2)):
             asked: list[int] = []
             for ahead in (None, 3):
                 asked.clear()
@@ -140,7 +158,7 @@ def test_a_stream_comes_in_order_and_is_bounded(cluster: LocalCluster) -> None:
 
 def test_an_error_in_a_stream_is_the_callers(cluster: LocalCluster) -> None:
     with Client(cluster) as client:
-        for executor in (SerialExecutor(), DaskExecutor(client)):
+        for executor in (SerialExecutor(), ThreadExecutor(2), DaskExecutor(client)):
             with pytest.raises(InputError, match="value 0 is not wanted"):
                 list(executor.stream(fail, [(0,), (1,)], "fail"))
 
