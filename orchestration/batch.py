@@ -1,11 +1,10 @@
-"""One batch of blocks into the network: each adjusted by itself, then registered, summed, factored and committed together."""
+"""One batch of blocks into the network: adjusted by themselves already, they are tested, registered, summed, factored, and committed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import zarr
@@ -16,7 +15,7 @@ from orchestration.executors import Executor
 from orchestration.gate import Candidate, common_cells, tested
 from orchestration.progress import Reporter
 from orchestration.reading import Incoming
-from orchestration.stage_one import BlockAdjustment, BlockRays, adjust_blocks
+from orchestration.stage_one import BlockAdjustment, BlockRays, adjust_block
 from orchestration.tasks import FlaggedImage
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.errors import KilledTaskError
@@ -32,7 +31,9 @@ from submin.tiling.cover import Cover
 
 T = TypeVar("T")
 
-BLOCKS_A_TASK = 16
+TESTED_TOGETHER = 16
+"""Blocks that a task tests by the network: neighbours ask for the same."""
+KILLED = "killed every worker that tried it, one after the other; give workers more memory, or look into their logs for what crashes"
 
 
 @dataclass(frozen=True)
@@ -98,8 +99,8 @@ def fuse_batch(
     """
     session, base = begin_change(where, version, known)
     come, refused = _sorted_out(batch, base.metadata.ellipsoid, executor)
-    tests = _tests(come, base, executor, reporter)
-    against = {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
+    tests, against = _tests(come, base, executor, reporter)
+    against |= {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
     come, move = _register(come, against, base, refused, executor)
     blocks = [one.block for one in come]
     unsaid = _unsaid(refused, base)
@@ -145,12 +146,12 @@ def _unsaid(refused: Sequence[Rejected], base: Snapshot) -> list[Rejected]:
 def _sorted_out(batch: Sequence[Incoming], ellipsoid: Ellipsoid, executor: Executor) -> tuple[list[Incoming], list[Rejected]]:
     """The blocks of a batch that stage 1 has accepted, and the rejections of the others. Those that it has not seen are adjusted now.
 
-    The workers of such a block were killed, its own one or that of others: each is adjusted with no other such block beside it.
+    Nearly always the workers of such a block were killed, its own one or that of others: each is adjusted with no other such block beside.
     """
     accepted, refused = [], []
     for come in batch:
         if come.reason is None and come.adjusted is None and come.block.kind == "images":
-            come = replace(come, adjusted=_adjusted_alone(BlockRays.of(come.block, come.images), ellipsoid, executor))
+            come = replace(come, adjusted=_adjusted_alone(come.rays, ellipsoid, executor))
         reason = come.reason or (None if come.adjusted is None else come.adjusted.reason)
         if reason is None:
             accepted.append(come)
@@ -160,30 +161,44 @@ def _sorted_out(batch: Sequence[Incoming], ellipsoid: Ellipsoid, executor: Execu
 
 
 def _adjusted_alone(rays: BlockRays, ellipsoid: Ellipsoid, executor: Executor) -> BlockAdjustment:
-    (outcome,) = executor.attempt_all(adjust_blocks, [([rays], ellipsoid)], "adjust", lambda: None)
+    (outcome,) = executor.attempt_all(adjust_block, [(rays, ellipsoid)], "adjust", lambda: None)
     if isinstance(outcome, KilledTaskError):
-        reason = (
-            f"its adjustment killed {outcome.workers} workers, one after the other; give workers more memory, "
-            "or look into their logs for what crashes"
-        )
-        return BlockAdjustment(rays.block_id, np.zeros(len(rays.image), dtype=np.bool_), reason)
-    adjusted: BlockAdjustment = outcome[0]
+        return BlockAdjustment(rays.block_id, np.zeros(len(rays.image), dtype=np.bool_), f"its adjustment {KILLED}")
+    adjusted: BlockAdjustment = outcome
     return adjusted
 
 
-def _tests(batch: Sequence[Incoming], base: Snapshot, executor: Executor, reporter: Reporter) -> dict[str, BlockTest]:
-    """The tests of those blocks that have points in common with the last version."""
+def _tests(
+    batch: Sequence[Incoming], base: Snapshot, executor: Executor, reporter: Reporter
+) -> tuple[dict[str, BlockTest], dict[str, str]]:
+    """The tests of those blocks that have points in common with the last version, and why those stay out that cannot be tested."""
     of_images = [come for come in batch if come.adjusted is not None]
     cells = common_cells([come.block for come in of_images], base)
     met = [(come, of_block) for come, of_block in zip(of_images, cells, strict=True) if of_block is not None]
-    groups = [met[k : k + BLOCKS_A_TASK] for k in range(0, len(met), BLOCKS_A_TASK)]
+    if not met:
+        return {}, {}
     shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
-    arguments: Sequence[tuple[list[Candidate], Snapshot]] = _OnDemand(
-        lambda k: ([Candidate(come.rays, come.adjusted, of_block) for come, of_block in groups[k] if come.adjusted], shared), len(groups)
-    )
-    handles = executor.submit_all(tested, arguments, "test", reporter.stage("testing blocks", len(groups)))
-    found = chain.from_iterable(executor.results(handles))
-    return {come.block.block_id: test for (come, _), test in zip(met, found, strict=True) if test is not None}
+
+    def candidates(first: int, last: int) -> tuple[list[Candidate], Snapshot]:
+        return [Candidate(come.rays, cast(BlockAdjustment, come.adjusted), of_block) for come, of_block in met[first:last]], shared
+
+    groups = _OnDemand(lambda k: candidates(k * TESTED_TOGETHER, (k + 1) * TESTED_TOGETHER), -(-len(met) // TESTED_TOGETHER))
+    outcomes = executor.attempt_all(tested, groups, "test", reporter.stage("testing blocks", len(groups)))
+    tests: dict[str, BlockTest] = {}
+    killed: dict[str, str] = {}
+    for k, (come, _) in enumerate(met):
+        outcome = outcomes[k // TESTED_TOGETHER]
+        if isinstance(outcome, KilledTaskError):  # one of the group may be to blame: each by itself
+            (alone,) = executor.attempt_all(tested, [candidates(k, k + 1)], "test", lambda: None)
+            if isinstance(alone, KilledTaskError):
+                killed[come.block.block_id] = f"its test by the network {KILLED}"
+                continue
+            found = alone[0]
+        else:
+            found = outcome[k % TESTED_TOGETHER]
+        if found is not None:
+            tests[come.block.block_id] = found
+    return tests, killed
 
 
 class _OnDemand(Sequence[T]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -60,8 +61,9 @@ class Executor(Protocol):
     ) -> Iterator[Any]:  # fmt: skip
         """The values of a function for tuples of arguments, in their order, a bounded number of them at a time: none is kept.
 
-        They are worked out where nothing else is to be done. ``ahead`` bounds the number further. Of a task whose workers were killed
-        again and again, or which waited on such a worker, the value is that of ``killed``, called here; without it that is an error.
+        On a cluster they are worked out where nothing else is to be done. ``ahead`` bounds the number further. Of a task whose workers
+        were killed again and again, or which waited on such a worker, the value is that of ``killed``, called here; without it that is
+        an error.
         """
         ...
 
@@ -150,13 +152,14 @@ class ThreadExecutor(SerialExecutor):
     def __init__(self, threads: int) -> None:
         self._threads = threads
         self._libraries = ThreadpoolController()
+        self._counting, self._inside = threading.Lock(), 0
 
     def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
         """See `Executor.submit_all`. BLAS takes one thread in each task: with several they wait for one another, and for all else.
 
         One task of much dense algebra is for `submit`, which leaves it all cores.
         """
-        with self._libraries.limit(limits=1, user_api="blas"), self._pool(name) as pool:
+        with self._one_thread_of_blas(), self._pool(name) as pool:
             handles = [pool.submit(recorded, name, function, *args) for args in arguments]
             try:
                 done = []
@@ -175,7 +178,7 @@ class ThreadExecutor(SerialExecutor):
         """See `Executor.stream`."""
         most = min(STREAMED * self._threads, ahead or STREAMED * self._threads)
         waiting: deque[Any] = deque()
-        with self._pool(name) as pool:
+        with self._one_thread_of_blas(), self._pool(name) as pool:
             try:
                 for args in arguments:
                     waiting.append(pool.submit(recorded, name, function, *args))
@@ -186,6 +189,21 @@ class ThreadExecutor(SerialExecutor):
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
+
+    @contextmanager
+    def _one_thread_of_blas(self) -> Iterator[None]:
+        """In the body BLAS takes one thread, everywhere in this process: from when the first comes in until the last has left."""
+        with self._counting:
+            self._inside += 1
+            if self._inside == 1:
+                self._limit = self._libraries.limit(limits=1, user_api="blas")
+        try:
+            yield
+        finally:
+            with self._counting:
+                self._inside -= 1
+                if not self._inside:
+                    self._limit.restore_original_limits()
 
     def _pool(self, name: str) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self._threads, thread_name_prefix=name)
@@ -203,7 +221,7 @@ class DaskExecutor:
         self._deserted, self.beside = deserted, deserted is not None
         self.workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
         self._address = client.scheduler.address
-        self._streams = 0
+        self._streams, self._second_starts = 0, set[str]()
 
     def share(self, value: Any) -> Any:
         """See `Executor.share`. A task, since scattered values are gone for good with the workers that hold them."""
@@ -229,6 +247,7 @@ class DaskExecutor:
 
         waiting = iter(range(len(arguments)))
         handles: list[Any] = [None] * len(arguments)
+        beside = self._streams > 0
         again: set[int] = set()
 
         def submit_next() -> Any:
@@ -240,23 +259,35 @@ class DaskExecutor:
             self._check_scheduler()
             return handles[k]
 
-        with self._losses_said():
-            first = [f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None]
-            running: Any = as_completed(first)
-            for future in running:
-                killed = future.status == "error" and isinstance(future.exception(), KilledWorker)
-                if killed and self._streams and (k := handles.index(future)) not in again:
-                    # a task of the stream on the same worker may be to blame, which has then had its last try, too
-                    again.add(k)
-                    handles[k] = self._start(function, arguments[k], name)
-                    running.add(handles[k])
-                    continue
-                if future.status != "finished" and not (past_kills and killed):
-                    future.result()  # raises the task's error here
-                advance()
-                following = submit_next()
-                if following is not None:
-                    running.add(following)
+        def started_again(killed: Any) -> Any:
+            """A task of a stream on the same worker may be to blame, which then has had its last try, too."""
+            k = handles.index(killed)
+            if not (beside or self._streams) or k in again:
+                return None
+            again.add(k)
+            handles[k] = self._start(function, arguments[k], name)
+            self._second_starts.add(handles[k].key)
+            return handles[k]
+
+        try:
+            with self._losses_said():
+                running: Any = as_completed([f for f in (submit_next() for _ in range(3 * self.workers)) if f is not None])
+                for future in running:
+                    killed = future.status == "error" and isinstance(future.exception(), KilledWorker)
+                    if killed and (second := started_again(future)) is not None:
+                        running.add(second)
+                        continue
+                    if future.status != "finished" and not (past_kills and killed):
+                        future.result()  # raises the task's error here
+                    advance()
+                    following = submit_next()
+                    if following is not None:
+                        running.add(following)
+        except BaseException:
+            for handle in handles:  # what waits at the workers need not be done
+                if handle is not None:
+                    handle.release()
+            raise
         return handles
 
     def submit(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
@@ -355,7 +386,8 @@ class DaskExecutor:
         try:
             yield
         except KilledWorker as error:
-            raise KilledTaskError(str(error.task).rpartition("-")[0], error.allowed_failures + 1) from None
+            workers = (error.allowed_failures + 1) * (2 if error.task in self._second_starts else 1)
+            raise KilledTaskError(str(error.task).rpartition("-")[0], workers) from None
         except (CancelledError, CommClosedError, ClosedClientError):
             raise self._lost() from None
         except OSError:

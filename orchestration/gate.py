@@ -73,8 +73,7 @@ class Gate:
             )  # fmt: skip
             if common is None:
                 return None
-            start = intersect(images, rays, len(block.ids))
-            return block_test(common, images, block.ids, rays, estimate.widened(p), start)
+            return block_test(common, images, block.ids, rays, estimate.widened(p), lambda: intersect(images, rays, len(block.ids)))
         except NumericalError:  # what cannot be computed is no reason against the block
             return None
 

@@ -22,7 +22,7 @@ from submin.storage.catalogue_schema import Block, defects
 T = TypeVar("T")
 
 BLOCKS_TOGETHER = 16
-"""Blocks of a task: their images are worked out at once."""
+"""Blocks of a task, in batches of as many or more: their images are worked out at once."""
 
 
 @dataclass(frozen=True)
@@ -68,15 +68,16 @@ def read_catalogue(catalogue: Catalogue, executor: Executor, batch_blocks: int, 
         As `Catalogue.block_rows`.
     """
     ellipsoid = catalogue.metadata.ellipsoid
-    groups = ((rows, ellipsoid, {each.block_id for each in rows}.intersection(here)) for rows in _groups(catalogue.block_rows()))
-    ahead = -(-max(batch_blocks, 1) // BLOCKS_TOGETHER)
+    together = min(BLOCKS_TOGETHER, max(batch_blocks, 1))
+    ahead = -(-max(batch_blocks, 1) // together)
+    groups = ((rows, ellipsoid, {each.block_id for each in rows}.intersection(here)) for rows in _groups(catalogue.block_rows(), together))
     for made in executor.stream(adjusted_from_rows, groups, "adjust", ahead=ahead, killed=ready_from_rows):
         yield from made
 
 
 def ready(blocks: Iterable[Block]) -> Iterator[Incoming]:
     """Blocks that are here already, made ready here."""
-    for group in _groups(blocks):
+    for group in _groups(blocks, BLOCKS_TOGETHER):
         yield from _ready(group)
 
 
@@ -101,7 +102,7 @@ def _ready(blocks: Sequence[Block]) -> list[Incoming]:
     return [Incoming(block, reason, next(images) if reason is None else ()) for block, reason in zip(blocks, reasons, strict=True)]
 
 
-def _groups(values: Iterable[T]) -> Iterator[list[T]]:
+def _groups(values: Iterable[T], size: int) -> Iterator[list[T]]:
     left = iter(values)
-    while group := list(islice(left, BLOCKS_TOGETHER)):
+    while group := list(islice(left, size)):
         yield group

@@ -5,7 +5,6 @@ What comes out depends on the block alone, so it can be worked out while earlier
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +76,7 @@ class BlockAdjustment:
 
 
 def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
-    """Stage 1 of one block: its blunders rejected, or the reason for which nothing comes of it."""
+    """A task: stage 1 of one block, its blunders rejected, or the reason for which nothing comes of it."""
     every = np.ones(len(block.image), dtype=np.bool_)
     try:
         images, (order, rays) = block.image_set(ellipsoid), block.ordered(every)
@@ -96,11 +95,6 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
         return BlockAdjustment(block.block_id, accepted, disagreement(accepted), result.estimate)
     except SubminError as error:
         return BlockAdjustment(block.block_id, every, str(error))
-
-
-def adjust_blocks(blocks: Sequence[BlockRays], ellipsoid: Ellipsoid) -> list[BlockAdjustment]:
-    """A task: stage 1 of some blocks."""
-    return [adjust_block(block, ellipsoid) for block in blocks]
 
 
 def disagreement(accepted: Flags) -> str | None:

@@ -21,6 +21,7 @@ class Prepared(WorkerPlugin):
 
 
 def _prepare() -> None:
-    import_module("orchestration.tasks")
+    for tasks in ("reading", "gate", "tasks"):
+        import_module(f"orchestration.{tasks}")
     compile_kernels()
     collect_seldom()

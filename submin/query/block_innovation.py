@@ -120,12 +120,14 @@ def _tile_of_most(source: NetworkSource, selections: Sequence[Selection]) -> int
     return max(sorted(held), key=lambda tile: (held[tile], owned[tile]), default=None)
 
 
-def block_test(common: CommonPoints, images: ImageSet, ids: Ids, rays: Rays, adjusted: BundleEstimate, start: Array) -> BlockTest | None:
+def block_test(
+    common: CommonPoints, images: ImageSet, ids: Ids, rays: Rays, adjusted: BundleEstimate, start: Callable[[], Array]
+) -> BlockTest | None:  # fmt: skip
     """Test a block, adjusted by itself, against what a network says of their common points; None when nothing can be compared.
 
     Parameters
     ----------
-    images : of the block; ids : (n,) its points, ascending; start : (n, 3) where they were registered
+    images : of the block; ids : (n,) its points, ascending; start : gives (n, 3) where they are registered, if that is needed
     rays : of the block, with what its own adjustment has accepted, which has put its cameras and points where ``adjusted`` says
     """
     released = images.release(adjusted.released)
@@ -146,7 +148,7 @@ def block_test(common: CommonPoints, images: ImageSet, ids: Ids, rays: Rays, adj
     unexplained = replace(plain, explained=False)
     try:
         # cameras are judged afresh: by itself the block may have blamed the wrong one
-        again = adjust_controlled(images, rays, start, lambda state: common.prior(state, ids))
+        again = adjust_controlled(images, rays, start(), lambda state: common.prior(state, ids))
     except NumericalError:
         return unexplained
     left_out, bad = int((~again.active).sum()), int(again.released.sum())

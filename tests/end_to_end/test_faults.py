@@ -23,6 +23,7 @@ from networks import rewrite, same_network
 from benchmarks.fault_scene import EVERYWHERE, Content, Scene, make_scene
 from benchmarks.faults import IN_COMMIT, IN_STAGE, KINDS, Moment, after, after_commit, begun, in_commit, trial, undisturbed_run
 from benchmarks.started import cluster, free_port, submin_command, wait_until
+from orchestration.batch import KILLED
 from orchestration.create import create
 from orchestration.executors import SerialExecutor, executor_for
 from orchestration.progress import Silent
@@ -94,31 +95,34 @@ def test_a_stopped_run_says_how_to_go_on(
     assert undisturbed[0].faults(Content.of(network)) == []
 
 
+@pytest.mark.parametrize("doing", ["adjustment", "test by the network"])
 def test_a_block_that_crashes_its_worker_each_time_is_rejected(
-    scene: Scene, undisturbed: tuple[Content, float], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:  # fmt: skip
+    doing: str, scene: Scene, undisturbed: tuple[Content, float], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """The fourth of six, in the second batch, where it shares its task with the third. Once it crashes no more it comes in."""
     blocks = list(Catalogue.open(scene.catalogue).blocks())
     bad = blocks[3].block_id
-    network = scene.network("crash")
+    name = f"crash-{doing.replace(' ', '-')}"
+    network = scene.network(name)
     with monkeypatch.context() as environment:
         environment.setenv(crashing_block.CRASHES, bad)
+        environment.setenv(crashing_block.DOING, doing)
         environment.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", crashing_block.__file__)
         environment.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "1")
-        with scene.run(network, "crash") as command:
+        with scene.run(network, name) as command:
             assert command.wait() == 1, command.err
             assert command.err == ""
             said = json.loads(command.out)
-    reason = "its adjustment killed 2 workers, one after the other; give workers more memory, or look into their logs for what crashes"
+    reason = f"its {doing} {KILLED}"
     assert said["blocks_fused"] == 5
     assert said["blocks_rejected"] == [{"block_id": bad, "reason": reason}]
     lines = Snapshot.open(str(network)).ledger(["block_id", "status", "reason"])
     assert [tuple(str(lines[name][k]) for name in lines) for k in np.flatnonzero(lines["block_id"] == bad)] == [(bad, "rejected", reason)]
-    without = scene.network("crash-without")
+    without = scene.network(f"{name}-without")
     run(Catalogue.open(rewrite(scene.catalogue, tmp_path / "without", blocks[:3] + blocks[4:])), str(without), SerialExecutor())
     reconcile(str(without), SerialExecutor())
     same_network(network, without)
-    with scene.run(network, "crash-no-more", "--workers", 0) as command:
+    with scene.run(network, f"{name}-no-more", "--workers", 0) as command:
         assert command.wait() == 0, command.err
     assert undisturbed[0].faults(Content.of(network)) == ["another ledger"]  # with the rejection
     same_network(network, scene.folder / "undisturbed")

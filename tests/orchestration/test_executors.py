@@ -322,5 +322,10 @@ def test_tasks_here_share_the_cores_with_no_threads_of_blas() -> None:
         assert executor.results(seen) == [{1}, {1}]
         alone = executor.submit_all(threads, [()], "look", lambda: None)
         assert executor.results(alone) == [{1}]
+        assert list(executor.stream(threads, [(), ()], "look")) == [{1}, {1}]
+        beside = executor.stream(threads, [()] * 20, "look")
+        assert next(beside) == {1}
+        assert executor.results(executor.submit_all(threads, [()], "look", lambda: None)) == [{1}]
+        assert list(beside) == [{1}] * 19  # also once the others have ended
         assert executor.results([executor.submit(threads, (), "look")]) == [{2}]
         assert threads() == {2}
