@@ -27,7 +27,7 @@ def plot(rows: Sequence[Mapping[str, Any]], workers: int, out: Path) -> None:
     import matplotlib.pyplot as plt
 
     out.mkdir(parents=True, exist_ok=True)
-    figure, axes = plt.subplots(figsize=(11, 3.4), constrained_layout=True)
+    figure, axes = plt.subplots(figsize=(11, 4.0), constrained_layout=True)
     for at, stage in enumerate(STAGES):
         left = 0.0
         for k, (name, seconds) in enumerate(parts_of(rows, stage, workers)):
@@ -47,7 +47,7 @@ def plot(rows: Sequence[Mapping[str, Any]], workers: int, out: Path) -> None:
     axes.set_yticks(range(len(STAGES)), list(STAGES))
     axes.set_ylim(-0.6, len(STAGES) - 0.2)
     axes.set_xlabel(f"seconds; tasks of {workers} workers as if none ever waited")
-    axes.legend(loc="upper right", fontsize=8, frameon=False)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(out / "china.png", dpi=110)
     plt.close(figure)

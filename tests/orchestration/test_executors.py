@@ -98,6 +98,7 @@ def test_threads_stop_at_an_error_and_say_it() -> None:
 
     def some_fail(value: int) -> int:
         begun.append(value)
+        time.sleep(0.02 * (value > 3))  # others are under way when the error is seen
         return fail(value) if value == 3 else double(value)
 
     with pytest.raises(InputError, match="value 3 is not wanted"):
