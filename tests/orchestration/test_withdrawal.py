@@ -20,7 +20,7 @@ from submin.errors import BusyError, InputError
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
-from submin.storage.ledger import Ledger
+from submin.storage.ledger import Ledger, blocks_in
 from submin.storage.network_store import Snapshot, begin_change, commit, summed_cells, versions
 from submin.storage.writer_lock import writing
 
@@ -62,6 +62,16 @@ def test_a_withdrawn_block_comes_again(region: SimulatedRegion, catalogue: Path,
     assert (again.fused, again.skipped, again.rejected) == (2, 10, ())
     same_network(base, complete)
     assert [v.message for v in versions(str(base))][1:3] == [f"block {b.block_id} withdrawn" for b in (blocks[1], blocks[0])]
+
+
+def test_what_is_in_a_network(region: SimulatedRegion, catalogue: Path, base: Path, blocks: list[Block], tmp_path: Path) -> None:
+    """Not what was withdrawn; still what has been refused since with other content."""
+    withdraw(str(base), HERE, block=blocks[0].block_id)
+    other = dataclasses.replace(blocks[1], line=blocks[1].line + 1.0)
+    (refused,) = fuse(rewrite(catalogue, tmp_path / "other", [other]), base, area_of(region)).rejected
+    assert refused.block_id == blocks[1].block_id
+    now = Snapshot.open(str(base))
+    assert blocks_in(now) == {entry.block_id for entry in Ledger.of(now).fused()} == {block.block_id for block in blocks[1:]}
 
 
 def test_a_withdrawn_image_was_never_there(
