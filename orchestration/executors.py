@@ -7,7 +7,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar
 
@@ -278,7 +278,7 @@ class DaskExecutor:
                         running.add(second)
                         continue
                     if future.status != "finished" and not (past_kills and killed):
-                        future.result()  # raises the task's error here
+                        _raise_error_of(future)
                     advance()
                     following = submit_next()
                     if following is not None:
@@ -307,7 +307,7 @@ class DaskExecutor:
             self._check_scheduler()
             for future in as_completed(handles):
                 if future.status != "finished":
-                    future.result()  # raises the task's error here
+                    _raise_error_of(future)
                 advance()
 
     def stream(
@@ -377,8 +377,6 @@ class DaskExecutor:
     @contextmanager
     def _losses_said(self) -> Iterator[None]:
         """What Dask raises when processes are lost, as one error that says it. Errors of tasks pass."""
-        from concurrent.futures import CancelledError
-
         from distributed import KilledWorker
         from distributed.client import ClosedClientError
         from distributed.comm.core import CommClosedError
@@ -405,6 +403,13 @@ class DaskExecutor:
                 "end what else runs there, or take smaller batches, and give the same command again",
             )
         return ClusterError(f"the Dask scheduler at {self._address} was lost", "start a cluster and give the same command again")
+
+
+def _raise_error_of(future: Any) -> None:
+    """Raise here what a task has raised. One that was cancelled is not asked: its client may be closing, and would never answer."""
+    if future.status == "cancelled":
+        raise CancelledError(future.key)
+    future.result()
 
 
 def _same(value: T) -> T:
