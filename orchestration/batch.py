@@ -25,6 +25,7 @@ from submin.network.registration import LooseRays, together
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import enter_check_points
 from submin.storage.control_blocks import points_of
+from submin.storage.directory import Directory
 from submin.storage.ledger import UNTESTED, Entry, Ledger
 from submin.storage.network_store import Snapshot, begin_change
 from submin.tiling.cover import Cover
@@ -99,9 +100,10 @@ def fuse_batch(
     """
     session, base = begin_change(where, version, known)
     come, refused = _sorted_out(batch, base.metadata.ellipsoid, executor)
-    tests, against = _tests(come, base, executor, reporter)
+    directory = base.directory_of(np.concatenate([np.empty(0, dtype="U1"), *(one.block.points[0] for one in come)]))
+    tests, against = _tests(come, base, directory, executor, reporter)
     against |= {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
-    come, move = _register(come, against, base, refused, executor)
+    come, move = _register(come, against, base, directory, refused, executor)
     blocks = [one.block for one in come]
     unsaid = _unsaid(refused, base)
     if not blocks and not unsaid:
@@ -169,11 +171,11 @@ def _adjusted_alone(rays: BlockRays, ellipsoid: Ellipsoid, executor: Executor) -
 
 
 def _tests(
-    batch: Sequence[Incoming], base: Snapshot, executor: Executor, reporter: Reporter
+    batch: Sequence[Incoming], base: Snapshot, directory: Directory, executor: Executor, reporter: Reporter
 ) -> tuple[dict[str, BlockTest], dict[str, str]]:
     """The tests of those blocks that have points in common with the last version, and why those stay out that cannot be tested."""
     of_images = [come for come in batch if come.adjusted is not None]
-    cells = common_cells([come.block for come in of_images], base)
+    cells = common_cells([come.block for come in of_images], directory)
     met = [(come, of_block) for come, of_block in zip(of_images, cells, strict=True) if of_block is not None]
     if not met:
         return {}, {}
@@ -225,7 +227,7 @@ def _tested(test: BlockTest | None, version: int) -> tuple[float, int, float, in
 
 
 def _register(
-    batch: list[Incoming], against: Mapping[str, str], base: Snapshot, refused: list[Rejected], executor: Executor
+    batch: list[Incoming], against: Mapping[str, str], base: Snapshot, directory: Directory, refused: list[Rejected], executor: Executor
 ) -> tuple[list[Incoming], Move]:
     """Register the rays of the batch; a block that measures a known point elsewhere, or nothing inside the area, is rejected.
 
@@ -233,7 +235,8 @@ def _register(
     """
     while True:
         blocks, rays = [come.block for come in batch], _arriving(batch, base.image_count())
-        move = place(base, take_points(base, rays.ids), rays, [image for come in batch for image in come.images], executor)
+        out = take_points(base, rays.ids, directory.cells_of(rays.ids))
+        move = place(base, out, rays, [image for come in batch for image in come.images], executor)
         bad = _misplaced(blocks, rays, move) or {k: against[b.block_id] for k, b in enumerate(blocks) if b.block_id in against}
         if not bad:
             return batch, move

@@ -68,6 +68,34 @@ class TakenOut:
 
 
 @dataclass(frozen=True)
+class Relocations:
+    """Where points come from and go that were taken out of their cells.
+
+    Attributes
+    ----------
+    left : (n,) the cell that each of them has left; goes : (n,) the one to which it goes, -1 where it goes nowhere
+    before : (k,) the cell that each point of a registration's directory has left, -1 for those that were not taken out of one
+    """
+
+    left: NDArray[np.int64]
+    goes: NDArray[np.int64]
+    before: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, out: TakenOut, registration: Registration) -> Relocations:
+        """Those of some points by where they were registered."""
+        ids, at = registration.directory
+        left = np.repeat(np.array(list(out.departures), dtype=np.int64), [len(of_cell) for of_cell in out.departures.values()])
+        if not len(left):
+            return cls(left, left, np.full(len(ids), -1, dtype=np.int64))
+        known, place = numbered(np.concatenate([ids, *out.departures.values()]))
+        arriving, leaving = place[: len(ids)], place[len(ids) :]
+        to, come_from = np.full(len(known), -1, dtype=np.int64), np.full(len(known), -1, dtype=np.int64)
+        to[arriving], come_from[leaving] = at, left
+        return cls(left, to[leaving], come_from[arriving])
+
+
+@dataclass(frozen=True)
 class Move:
     """Where every touched point goes.
 
@@ -85,6 +113,11 @@ class Move:
     registration: Registration
     contradictions: dict[int, tuple[str, float]]
     images: tuple[NetworkImage, ...]
+
+    @cached_property
+    def relocations(self) -> Relocations:
+        """Where the points come from and go that were taken out."""
+        return Relocations.of(self.out, self.registration)
 
 
 @dataclass(frozen=True)
@@ -117,9 +150,8 @@ class Settled:
         return tuple(image for report in self.reports for image in report.flagged)
 
 
-def take_points(base: Snapshot, ids: Ids) -> TakenOut:
-    """Take those of some points that the network has out of their cells."""
-    known = base.candidate_cells(ids)
+def take_points(base: Snapshot, ids: Ids, known: NDArray[np.int64]) -> TakenOut:
+    """Take those of some points that the network has out of their cells, which the directory knows (-1: none)."""
     rays, departures = [], {}
     for number in np.unique(known[known >= 0]).tolist():
         cell = base.cell(number, with_sums=False)
@@ -236,8 +268,8 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     arrivals, departures = move.registration.arrivals, move.out.departures
     tiles = _touched_tiles(cover, move.out, move.registration)
     shared = executor.share(list(move.images))
-    left, goes = _departures(move)
-    origins = _origins(left, goes)
+    moves = move.relocations
+    origins = _origins(moves.left, moves.goes)
     arguments = []
     # the largest first: at the end no worker is left with much to do while others wait
     for tile in sorted(tiles, key=lambda tile: -sum(len(arrivals[c].image) for c in move.cover.cells_held(tile) if c in arrivals)):
@@ -275,28 +307,17 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     no_more = {done.tile for done in factored if not done.images} | (split - {*base.cover.splits})
     gone += [f"{group}/{base.cover.tile_name(tile)}" for tile in sorted(no_more) for group in ("tiles", TILE_STATES)]
     rejected = _rejected_rays((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
-    return Settled(tuple(reports), _changes(base, move, reports, origins, left[goes < 0]), frozenset(flags), tuple(gone), rejected)
+    changes = _changes(base, move, reports, origins, moves.left[moves.goes < 0])
+    return Settled(tuple(reports), changes, frozenset(flags), tuple(gone), rejected)
 
 
 def _origins(before: NDArray[np.int64], after: NDArray[np.int64]) -> dict[int, tuple[int, ...]]:
-    """For each cell at which points arrive from other cells that are still there: these cells. Arguments as `_departures` gives them."""
+    """For each cell at which points arrive from other cells that are still there: these cells. Arguments as `Relocations` has them."""
     moved = (after >= 0) & (after != before)
     found: dict[int, tuple[int, ...]] = {}
     for to, origin in np.unique(np.column_stack([after[moved], before[moved]]), axis=0).tolist():
         found[to] = (*found.get(to, ()), origin)
     return found
-
-
-def _departures(move: Move) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The cell (n,) that each point which was taken out has left, and the one (n,) to which it goes; -1 where it goes nowhere."""
-    out, (ids, at) = move.out.departures, move.registration.directory
-    left = np.repeat(np.array(list(out), dtype=np.int64), [len(of_cell) for of_cell in out.values()])
-    if not len(left):
-        return left, left
-    known, place = numbered(np.concatenate([ids, *out.values()]))
-    goes = np.full(len(known), -1, dtype=np.int64)
-    goes[place[: len(ids)]] = at
-    return left, goes[place[len(ids) :]]
 
 
 def _changes(
@@ -343,7 +364,7 @@ def finish(
     note_changes(root, base, version, settled.changes)
     append_entries(group_of(root, "ledger"), entries)
     ids, at = move.registration.directory
-    listed = (at >= 0) & (base.candidate_cells(ids) != at)
+    listed = (at >= 0) & (move.relocations.before != at)
     append_table(group_of(root, "directory"), {"hash": hash_ids(ids[listed]), "cell": at[listed]})
     metadata = replace(base.metadata, cover=move.cover.to_mapping(), parameters=move.parameters)
     if metadata != base.metadata:

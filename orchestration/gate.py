@@ -18,6 +18,7 @@ from submin.network.sub_min import SubMin
 from submin.query.block_innovation import block_test, common_points
 from submin.sensors import width_of
 from submin.storage.catalogue_schema import Block
+from submin.storage.directory import Directory
 from submin.storage.network import Network
 from submin.storage.network_store import Snapshot
 
@@ -31,12 +32,12 @@ class Candidate:
     cells: NDArray[np.int64]
 
 
-def common_cells(blocks: Sequence[Block], base: Snapshot) -> list[NDArray[np.int64] | None]:
-    """The cell of each point of each block (ids ascending), None where the network has none of them. The directory is read once."""
-    if not base.image_count() or not blocks:
+def common_cells(blocks: Sequence[Block], directory: Directory) -> list[NDArray[np.int64] | None]:
+    """The cell of each point of each block (ids ascending) by the directory of a network, None where it has none of them."""
+    if not len(directory) or not blocks:
         return [None] * len(blocks)
     of_blocks = [block.points[0] for block in blocks]
-    cells = np.split(base.candidate_cells(np.concatenate(of_blocks)), np.cumsum([len(ids) for ids in of_blocks])[:-1])
+    cells = np.split(directory.cells_of(np.concatenate(of_blocks)), np.cumsum([len(ids) for ids in of_blocks])[:-1])
     return [of_block if (of_block >= 0).any() else None for of_block in cells]
 
 

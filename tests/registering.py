@@ -110,9 +110,6 @@ class Fused:
     directory: dict[str, int] = field(default_factory=dict)
     cover: Cover = COVER
 
-    def candidate_cells(self, ids: NDArray[np.str_]) -> NDArray[np.int64]:
-        return np.array([self.directory.get(str(i), -1) for i in ids], dtype=np.int64)
-
     def cell(self, number: int, *, with_sums: bool = True) -> Cell:
         return self.cells.get(number, empty_cell(number, P))
 
@@ -127,7 +124,9 @@ class Fused:
 
     def add(self, rays: LooseRays) -> Registration:
         """New rays come."""
-        return self._change(rays, take_points(self, np.unique(rays.point_ids)))  # type: ignore[arg-type]
+        ids = np.unique(rays.point_ids)
+        known = np.array([self.directory.get(str(i), -1) for i in ids], dtype=np.int64)
+        return self._change(rays, take_points(self, ids, known))  # type: ignore[arg-type]
 
     def withdraw(self, images: Collection[int]) -> Registration:
         """Images leave."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,19 @@ class Directory:
 
     hash: NDArray[np.uint64]
     cell: NDArray[np.int64]
+
+    @classmethod
+    def of_points(cls, pieces: Iterable[Directory], point_ids: NDArray[np.str_]) -> Directory:
+        """What a directory says of some points. It comes in pieces, in the order of its entries, and no two need be in memory at a time."""
+        wanted = np.unique(hash_ids(point_ids))
+        cell = np.full(len(wanted), -1, dtype=np.int64)
+        for piece in pieces:
+            later = look_up(piece.hash, piece.cell, wanted)
+            np.copyto(cell, later, where=later >= 0)
+        return cls(wanted[cell >= 0], cell[cell >= 0])
+
+    def __len__(self) -> int:
+        return len(self.hash)
 
     def cells_of(self, point_ids: NDArray[np.str_]) -> NDArray[np.int64]:
         """Cell (n,) in which each point would be; -1 for points that are not in the network. The ids in the cell decide."""

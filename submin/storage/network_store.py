@@ -27,6 +27,7 @@ from submin.network.cell import Cell, empty_cell, empty_sums, widened_sums
 from submin.network.network_image import NetworkImage, image_priors
 from submin.network.sub_min import SubMin
 from submin.storage.arrays import (
+    TABLE_CHUNK,
     attributes_of,
     create_table,
     existing_groups,
@@ -70,6 +71,8 @@ _CONFIGURATION = icechunk.RepositoryConfig(
 """A question reads a few of the thousands of arrays; what Icechunk would read ahead of it at each opening is of others."""
 _TAG, _OWN_NAME = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r"v\d+")
 READ_OVER_ROWS = 32
+DIRECTORY_PIECE = 16 * TABLE_CHUNK
+"""Entries of the directory that are looked through at a time."""
 _ABSENT = "no such network; make one with 'submin create'"
 _TAKEN = "already exists; choose another place, or remove it first"
 
@@ -403,16 +406,27 @@ class Snapshot:
 
     def candidate_cells(self, point_ids: NDArray[np.str_]) -> NDArray[np.int64]:
         """Cell (n,) in which each point would be, by the directory; -1 for points that are not in the network."""
-        return self.directory().cells_of(point_ids)
+        return self.directory_of(point_ids).cells_of(point_ids)
+
+    def directory_of(self, point_ids: NDArray[np.str_]) -> Directory:
+        """What the directory says of some points: in memory is a piece of it at a time, however many points the network has."""
+        return Directory.of_points(self._directory_pieces(), point_ids)
+
+    def _directory_pieces(self) -> Iterator[Directory]:
+        if "_directory" in vars(self):
+            yield self._directory
+            return
+        table = group_of(self.root, "directory")
+        for start in range(0, table_length(table), DIRECTORY_PIECE):
+            yield Directory(**read_table(table, DIRECTORY_COLUMNS, start, start + DIRECTORY_PIECE))
 
     def directory(self) -> Directory:
-        """The directory of all points, 16 bytes each."""
+        """The directory of all points, 16 bytes each; it is kept."""
         return self._directory
 
     @cached_property
     def _directory(self) -> Directory:
-        columns = read_table(group_of(self.root, "directory"))
-        return Directory(columns["hash"], columns["cell"])
+        return Directory(**read_table(group_of(self.root, "directory"), DIRECTORY_COLUMNS))
 
 
 def commit(session: icechunk.Session, version: int, message: str) -> None:

@@ -22,6 +22,7 @@ from submin.errors import ConflictError, QueryError, StoreError
 from submin.geodesy import Ellipsoid
 from submin.network.cell import Cell
 from submin.network.sub_min import SubMin
+from submin.storage import network_store
 from submin.storage.arrays import append_table, group_of, hash_ids
 from submin.storage.network_store import Snapshot, begin_change, commit, create_network, find_version, tag_version, versions
 from submin.storage.schema import (
@@ -472,7 +473,9 @@ def test_images_come_back_by_row(tmp_path: Path) -> None:
     assert snapshot.image_columns(["block_id"])["block_id"].tolist() == [f"block_id {k}" for k in range(9)]
 
 
-def test_directory_finds_the_last_cell_of_a_point(tmp_path: Path) -> None:
+@pytest.mark.parametrize("entries_at_a_time", [1, 3, 4, 100])
+def test_directory_finds_the_last_cell_of_a_point(tmp_path: Path, entries_at_a_time: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_store, "DIRECTORY_PIECE", entries_at_a_time)
     place = new(tmp_path)
 
     def enter(root: zarr.Group, points: list[str], cells: list[int]) -> None:
@@ -483,6 +486,12 @@ def test_directory_finds_the_last_cell_of_a_point(tmp_path: Path) -> None:
     wanted = np.array(["moved", "none", "点", "a", "moved", "c"])
     np.testing.assert_array_equal(Snapshot.open(place).candidate_cells(wanted), [44, -1, 3, 1, 44, 5])
     np.testing.assert_array_equal(Snapshot.open(place, "v1").candidate_cells(wanted), [4, -1, 3, 1, 4, -1])
+    whole = Snapshot.open(place)
+    np.testing.assert_array_equal(whole.directory().cells_of(wanted), [44, -1, 3, 1, 44, 5])
+    assert len(whole.directory()) == 7
+    some = whole.directory_of(wanted[:2])
+    assert len(some) == 1
+    np.testing.assert_array_equal(some.cells_of(wanted[:2]), [44, -1])
 
 
 def test_ledger_comes_back(tmp_path: Path) -> None:
