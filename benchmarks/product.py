@@ -15,16 +15,19 @@ _COMMAND = "from orchestration.cli import main; main()"
 _ENVIRONMENT = {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
-def submin_json(*words: object) -> Mapping[str, Any]:
+def submin_json(*words: object, cores: int | None = None) -> Mapping[str, Any]:
     """What a command of ``submin`` prints with ``--json``; a process of its own, so that its memory is its own.
+
+    ``cores`` bounds those that it and its workers may use (Linux only).
 
     Raises
     ------
     RuntimeError
         With what it said, when it ends with an error; exit code 1 is an answer.
     """
+    bound = [] if cores is None else ["taskset", "--cpu-list", ",".join(map(str, sorted(os.sched_getaffinity(0))[:cores]))]
     done = subprocess.run(
-        [sys.executable, "-c", _COMMAND, *map(str, words), "--json"], capture_output=True, text=True, env=os.environ | _ENVIRONMENT,
+        [*bound, sys.executable, "-c", _COMMAND, *map(str, words), "--json"], capture_output=True, text=True, env=os.environ | _ENVIRONMENT,
         check=False,
     )  # fmt: skip
     if done.returncode not in (0, 1):

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from benchmarks.china import OVERLAP_KM
-from benchmarks.comparison import verdict
+from benchmarks.comparison import DATA, verdict
 from benchmarks.product import submin_json
 from benchmarks.record import write_record
 
@@ -25,6 +26,8 @@ SPEED_UP, TIME_SPREAD, MEMORY_SPREAD = 1.8, 1.15, 1.20
 BATCH_BLOCKS = 220
 """Blocks of a commit: four batches in the smallest part. Tiles on the rim of a batch are judged again; one or two batches have less rim."""
 STAGE_ONE = "stage 1, ms of a processor a block"
+ALL = "all"
+"""Cores of the machine."""
 ALONE = PARTS[1]
 """The part that one worker does too: minutes of work, so that what it takes to start does not count."""
 
@@ -32,21 +35,24 @@ ALONE = PARTS[1]
 def measure(scale: float, workers: int, out: Path | None = None) -> Rows:
     """Rows of each part of China (times ``scale``) on so many workers, of `ALONE` on one too, and of what is asked for.
 
-    ``out``: folder for ``scaling.json``.
+    One worker has all cores, of which the coordinator then takes a second one, and once a single core for both. Runs on several workers
+    come before and after, since the machine changes. ``out``: folder for ``scaling.json``.
     """
-    rows = []
+    ran: dict[float, Rows] = {}
     for part in PARTS:
         with tempfile.TemporaryDirectory() as folder:
             catalogue = Path(folder) / "catalogue"
             submin_json("simulate", "china", "--out", catalogue, "--scale", part * scale, "--workers", workers)
-            rows += [_ran(catalogue, Path(folder) / f"network-{n}", part, n) for n in ({1, workers} if part == ALONE else {workers})]
-    by_part = [row for row in rows if row["workers"] == workers]
-    one, several = (next(row for row in rows if row["part of China"] == ALONE and row["workers"] == n) for n in (1, workers))
+            ways = ((workers, None), (1, None), (1, 1), (workers, None)) if part == ALONE else ((workers, None),)
+            ran[part] = [_ran(catalogue, Path(folder) / f"network-{k}", part, *way) for k, way in enumerate(ways)]
+    several, one, one_core, several_again = (row["seconds"] for row in ran[ALONE])
+    by_part = [of_part[0] for of_part in ran.values()]
     times, stage_one, memory = ([row[column] for row in by_part] for column in ("ms a block", STAGE_ONE, "peak, MB"))
     at_one_speed = [time * stage_one[0] / taken for time, taken in zip(times, stage_one, strict=True)]
     every = [
-        *rows,
-        _claim(f"{workers} workers against one, {ALONE:.2f} of China", one["seconds"] / several["seconds"], SPEED_UP, above=True),
+        *(row for of_part in ran.values() for row in of_part),
+        _claim(f"{workers} workers against one, {ALONE:.2f} of China", one / fmean([several, several_again]), SPEED_UP, above=True),
+        _claim(f"{workers} workers against one that shares a core with the coordinator", one_core / fmean([several, several_again]), None),
         _claim("time a block, most to least", max(times) / min(times), TIME_SPREAD),
         _claim("the same, as fast as the machine was in the first part", max(at_one_speed) / min(at_one_speed), TIME_SPREAD),
         _claim("peak memory, most to least", max(memory) / min(memory), MEMORY_SPREAD),
@@ -56,20 +62,25 @@ def measure(scale: float, workers: int, out: Path | None = None) -> Rows:
     return every
 
 
-def _ran(catalogue: Path, network: Path, part: float, workers: int) -> dict[str, Any]:
+def _ran(catalogue: Path, network: Path, part: float, workers: int, cores: int | None) -> dict[str, Any]:
     submin_json("create", network, "--fit", catalogue, "--overlap-km", OVERLAP_KM)
-    ran = submin_json("run", catalogue, network, "--workers", workers, "--batch-blocks", BATCH_BLOCKS, "--no-reconcile")
+    ran = submin_json("run", catalogue, network, "--workers", workers, "--batch-blocks", BATCH_BLOCKS, "--no-reconcile", cores=cores)
     outside = submin_json("reconcile", network, "--workers", workers)
     blocks = ran["blocks_fused"]
-    stage_one = ran["tasks"]["adjust"]["processor_seconds"]
+    stage_one, judged = ran["tasks"]["adjust"]["processor_seconds"], ran["tasks"]["update-tile"]
     return {
-        "part of China": part, "blocks": blocks, "workers": workers, "seconds": ran["seconds"], "blocks/s": blocks / ran["seconds"],
-        "ms a block": 1e3 * ran["seconds"] / blocks, STAGE_ONE: 1e3 * stage_one / blocks, "peak, MB": ran["peak_memory_mb"],
+        "part of China": part, "blocks": blocks, "workers": workers, "cores": cores or ALL, "seconds": ran["seconds"],
+        "blocks/s": blocks / ran["seconds"],
+        "ms a block": 1e3 * ran["seconds"] / blocks, STAGE_ONE: 1e3 * stage_one / blocks,
+        "tiles judged a block": judged["tasks"] / blocks, "judging, ms of a processor a block": 1e3 * judged["processor_seconds"] / blocks,
+        "peak, MB": ran["peak_memory_mb"],
         "reconcile, s": outside["seconds"], "reconcile, ms a block": 1e3 * outside["seconds"] / blocks,
         "its peak, MB": outside["peak_memory_mb"], "largest front": outside["largest_front"],
     }  # fmt: skip
 
 
-def _claim(what: str, ratio: float, limit: float, *, above: bool = False) -> dict[str, Any]:
+def _claim(what: str, ratio: float, limit: float | None, *, above: bool = False) -> dict[str, Any]:
+    if limit is None:
+        return {"ratio": what, "wanted": "", "found": ratio, "verdict": DATA}
     met = ratio >= limit if above else ratio <= limit
     return {"ratio": what, "wanted": f"{'at least' if above else 'at most'} {limit:g}", "found": ratio, "verdict": verdict(met)}

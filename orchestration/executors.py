@@ -14,7 +14,7 @@ from typing import Any, Protocol, TypeVar
 from threadpoolctl import ThreadpoolController
 
 from orchestration.local_cluster import Deserted, local_cluster
-from orchestration.memory import give_back, keep_freed, own_peak_memory_mb, seldom_collected
+from orchestration.memory import give_back, keep_freed, own_peak_memory_mb, seldom_collected, share_heaps
 from orchestration.task_record import TaskRecord, added, recorded, taken_notes
 from submin.errors import ClusterError, InputError, KilledTaskError
 
@@ -420,7 +420,7 @@ def _same(value: T) -> T:
 def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Executor]:
     """Threads of this process for no workers; a local cluster of so many processes, one BLAS thread each; or the cluster at an address.
 
-    Threads of this process share its memory: from then on the process keeps what is freed (`keep_freed`).
+    Settings of this process's memory stay as they are then: its threads share heaps, and with no workers beside they keep what is freed.
 
     Raises
     ------
@@ -432,6 +432,7 @@ def executor_for(workers: int = 0, scheduler: str | None = None) -> Iterator[Exe
         with seldom_collected():
             yield ThreadExecutor(os.cpu_count() or 1)
         return
+    share_heaps()
     import dask
     from distributed import Client
 

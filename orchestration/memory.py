@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import resource
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,18 +22,29 @@ def own_peak_memory_mb() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-KEPT_FREE = (("MALLOC_ARENA_MAX", -8, 1), ("MALLOC_MMAP_THRESHOLD_", -3, 32 << 20), ("MALLOC_TRIM_THRESHOLD_", -1, 256 << 20))
-"""Settings of glibc by the name in a process's environment and by their number in its malloc.h: new threads share the heaps that are there,
-which keep what is freed, but for the largest arrays. Otherwise each array would be cleared anew, page by page, by the system."""
+SHARED_HEAPS = (("MALLOC_ARENA_MAX", -8, 1),)
+"""Settings of glibc by the name in a process's environment and by their number in its malloc.h: new threads share the heaps that are there.
+What each of many threads kept in pieces of its own would never come together."""
+KEPT_FREE = (*SHARED_HEAPS, ("MALLOC_MMAP_THRESHOLD_", -3, 32 << 20), ("MALLOC_TRIM_THRESHOLD_", -1, 256 << 20))
+"""The same, and heaps keep what is freed, but for the largest arrays: else each would be cleared anew, page by page, by the system."""
+
+
+def share_heaps() -> None:
+    """Let threads share heaps, from now on in this process, where its C library (glibc) can."""
+    _set(SHARED_HEAPS)
 
 
 def keep_freed() -> None:
     """Keep freed memory for what is asked for next, from now on in this process, where its C library (glibc) can; see `give_back`."""
+    _set(KEPT_FREE)
+
+
+def _set(settings: Sequence[tuple[str, int, int]]) -> None:
     try:
         mallopt = ctypes.CDLL("libc.so.6").mallopt
     except (OSError, AttributeError):
         return
-    for _, parameter, value in KEPT_FREE:
+    for _, parameter, value in settings:
         mallopt(parameter, value)
 
 
