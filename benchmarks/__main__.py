@@ -53,7 +53,7 @@ BENCHMARKS: dict[str, tuple[str, Callable[..., list[dict[str, Any]]]]] = {
     "worldview": ("Tables 3 to 6 of the 2010 paper; pair = cell = simultaneous; time a pair", worldview.measure),
 }
 
-WITH_OUT = ("five-blocks", "worldview", "correlation", "continuity", "peers", "china", "scaling", "query")
+WITH_OUT = ("five-blocks", "worldview", "correlation", "continuity", "peers", "china", "scaling", "query", "faults")
 
 GOOD = (MET, DATA, faults.IDENTICAL, "")
 """Verdicts that ask for nothing; the paper's own lines have none."""

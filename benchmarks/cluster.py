@@ -24,8 +24,9 @@ from orchestration.run import run
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.arrays import append_table, group_of, write_record
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot, begin_change, commit
+from submin.storage.commit import begin_change, commit
 from submin.storage.simulated import write_region
+from submin.storage.snapshot import Snapshot
 
 Rows = list[dict[str, Any]]
 TASKS, POINTS, IDS = 3000, 4_000_000, 1000

@@ -25,8 +25,9 @@ from rich.console import Console
 
 from benchmarks.fault_scene import Content, Scene, make_scene
 from benchmarks.reader import Reader, Readings
+from benchmarks.record import write_record
 from benchmarks.started import Command, cluster, free_port, wait_until
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import LOCK_FILE
 
 LONGEST_COMMIT = 0.02
@@ -249,10 +250,11 @@ def drawn(kind: str, batches: int, seconds: float, rng: random.Random) -> Moment
     return after(rng.uniform(0.0, seconds))
 
 
-def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None) -> list[dict[str, Any]]:
+def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None, out: Path | None = None) -> list[dict[str, Any]]:
     """Rows of kill, moment, what was found, and the differences; at scale 1 the region is 120 km x 120 km, 12 blocks in 6 batches.
 
-    Without workers runs are of one process, the coordinator, and that is killed.
+    Kinds of kills come in turn. Without workers runs are of one process, the coordinator, and that is killed. ``out``: folder for
+    ``faults.json``.
     """
     seed = secrets.randbelow(1_000_000) if seed is None else seed
     rng, say = random.Random(seed), Console(stderr=True, highlight=False)
@@ -276,6 +278,8 @@ def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None
             except TooLate:
                 shutil.rmtree(scene.folder / name)
                 continue
-            rows.append({"kill": len(rows) + 1, **done.to_row()})
+            rows.append({"kill": len(rows) + 1, "seed": seed, **done.to_row()})
             say.print(", ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in rows[-1].values()), soft_wrap=True)
+    if out is not None:
+        write_record(out, "faults", scale, workers, rows)
     return rows

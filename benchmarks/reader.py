@@ -14,7 +14,7 @@ from pathlib import Path
 
 import submin
 from benchmarks.fault_scene import EVERYWHERE
-from submin.storage.network_store import versions
+from submin.storage.repository import versions
 
 
 @dataclass(frozen=True)

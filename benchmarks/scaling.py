@@ -9,6 +9,7 @@ the processor time that it took tells how fast the machine was meanwhile, and ti
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from pathlib import Path
 from statistics import fmean
@@ -66,6 +67,7 @@ def _ran(catalogue: Path, network: Path, part: float, workers: int, cores: int |
     submin_json("create", network, "--fit", catalogue, "--overlap-km", OVERLAP_KM)
     ran = submin_json("run", catalogue, network, "--workers", workers, "--batch-blocks", BATCH_BLOCKS, "--no-reconcile", cores=cores)
     outside = submin_json("reconcile", network, "--workers", workers)
+    shutil.rmtree(network)  # three Chinas take 30 GB
     blocks = ran["blocks_fused"]
     stage_one, judged = ran["tasks"]["adjust"]["processor_seconds"], ran["tasks"]["update-tile"]
     return {

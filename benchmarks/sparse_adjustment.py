@@ -26,7 +26,7 @@ from submin.network.sub_min import GroundPart, loadings
 from submin.query.planner import Selection, determined_parts
 from submin.storage.arrays import group_of, read_records
 from submin.storage.network import Network
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

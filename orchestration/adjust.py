@@ -34,8 +34,8 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, CatalogueMetadata, PointTable, defects
 from submin.storage.ledger import Ledger
 from submin.storage.network import Network
-from submin.storage.network_store import Snapshot
 from submin.storage.point_table import RULE_0
+from submin.storage.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

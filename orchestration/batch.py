@@ -24,10 +24,11 @@ from submin.network.innovation import REJECTED, BlockTest
 from submin.network.registration import LooseRays, together
 from submin.storage.catalogue_schema import Block
 from submin.storage.check_points import enter_check_points
+from submin.storage.commit import begin_change
 from submin.storage.control_blocks import points_of
 from submin.storage.directory import Directory
 from submin.storage.ledger import UNTESTED, Entry, Ledger
-from submin.storage.network_store import Snapshot, begin_change
+from submin.storage.snapshot import Snapshot
 from submin.tiling.cover import Cover
 
 T = TypeVar("T")

@@ -35,10 +35,12 @@ from submin.network.registration import (
 from submin.sensors import width_of
 from submin.storage.arrays import append_table, group_of, hash_ids, replace_table, set_rows
 from submin.storage.catalogue_schema import ImageRecord
+from submin.storage.commit import commit
 from submin.storage.ledger import Entry, append_entries
-from submin.storage.network_store import Snapshot, commit, summed_cells
+from submin.storage.ray_totals import summed_cells
 from submin.storage.reconciled import EVERYWHERE, TILE_STATES, Changes, note_changes
 from submin.storage.schema import image_columns, write_joint
+from submin.storage.snapshot import Snapshot
 from submin.tiling.cover import Cover
 
 Ids = NDArray[np.str_]

@@ -12,7 +12,7 @@ from orchestration.run import fuse_blocks
 from submin.adjustment.surveyed_points import ContradictedPoint
 from submin.storage.catalogue_schema import PointTable
 from submin.storage.control_blocks import control_blocks
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 
 @dataclass(frozen=True)

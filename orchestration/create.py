@@ -20,7 +20,7 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata
 from submin.storage.dense_store import create_dense
 from submin.storage.image_footprints import image_footprints
-from submin.storage.network_store import create_network
+from submin.storage.repository import create_network
 from submin.storage.schema import NetworkMetadata
 from submin.tiling.area import check_on_globe, cover_area
 from submin.tiling.cover import Cover

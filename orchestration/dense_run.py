@@ -26,10 +26,11 @@ from submin.network.pending import DenseNetwork, check_regular
 from submin.storage.arrays import append_table, group_of, set_rows
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, ImageRecord, PointTable, defects
+from submin.storage.commit import begin_change, commit
 from submin.storage.dense_store import Member, append_members, read_members, read_points, read_state, write_state
 from submin.storage.ledger import Entry, Ledger, append_entries
-from submin.storage.network_store import Snapshot, begin_change, commit
 from submin.storage.schema import image_columns
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import writing
 
 FAR_METRES = 1000.0

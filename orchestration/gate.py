@@ -20,7 +20,7 @@ from submin.sensors import width_of
 from submin.storage.catalogue_schema import Block
 from submin.storage.directory import Directory
 from submin.storage.network import Network
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 
 @dataclass(frozen=True)

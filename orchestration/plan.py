@@ -32,7 +32,7 @@ from submin.storage.control_blocks import control_blocks
 from submin.storage.dense_reader import refuse_dense
 from submin.storage.image_footprints import image_footprints
 from submin.storage.ledger import Ledger
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 from submin.tiling.cover import Cover
 from submin.tiling.footprints import FootprintIndex, Shapes
 

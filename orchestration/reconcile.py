@@ -24,8 +24,8 @@ from submin.errors import InputError
 from submin.network.outside_messages import Elimination, Message, State, complete, eliminate, front_of
 from submin.network.sub_min import add_sums
 from submin.network.whitened_vectors import Vectors, vectors_of
+from submin.storage.commit import begin_change, commit
 from submin.storage.dense_reader import is_dense
-from submin.storage.network_store import Snapshot, begin_change, commit
 from submin.storage.reconciled import (
     ImageDirectory,
     ReconciledStore,
@@ -37,6 +37,7 @@ from submin.storage.reconciled import (
     write_tile_state,
     write_tree,
 )
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import writing
 from submin.tiling.tile_tree import TileTree, TreeNode, trees_of
 

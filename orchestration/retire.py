@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from submin import Network
 from submin.errors import InputError
-from submin.storage.network_store import begin_change, commit
+from submin.storage.commit import begin_change, commit
 from submin.storage.validity import Validity, append_validity, read_date
 from submin.storage.writer_lock import writing
 

@@ -27,7 +27,7 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import control_blocks, observed_positions, points_of
 from submin.storage.ledger import Ledger, blocks_in
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import writing
 
 T = TypeVar("T")

@@ -99,7 +99,7 @@ def resumable(place: str) -> Iterator[None]:
 
 def _committed(place: str) -> str:
     from submin.errors import SubminError
-    from submin.storage.network_store import Snapshot
+    from submin.storage.snapshot import Snapshot
 
     try:
         return f"everything committed stays ({place} is at {Snapshot.open(place).version})"

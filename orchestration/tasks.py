@@ -22,8 +22,8 @@ from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import Located, LooseRays, locate
 from submin.network.sub_min import add_sums, factor
 from submin.sensors import sensor_named, width_of
-from submin.storage.network_store import Snapshot
 from submin.storage.schema import write_cell, write_sub_min
+from submin.storage.snapshot import Snapshot
 from submin.tiling.cover import Cover
 
 LEAST_STATISTIC = 3.0

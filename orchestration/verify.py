@@ -14,8 +14,8 @@ from orchestration.progress import Reporter, Silent
 from orchestration.verify_reconciled import verify_reconciled
 from submin.errors import StoreError, SubminError
 from submin.network.variance_factor import VarianceFactor, pooled
-from submin.storage.network_store import Snapshot
 from submin.storage.problems import DAMAGE, Problem, first_line
+from submin.storage.snapshot import Snapshot
 from submin.storage.verify_dense import verify_dense
 from submin.storage.verify_tables import stored_tiles, verify_network
 from submin.storage.verify_tile import TileHealth, verify_tile

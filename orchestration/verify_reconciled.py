@@ -14,9 +14,9 @@ from orchestration.progress import Reporter
 from orchestration.reconcile import collected, eliminate_node, eliminate_tile, plan_trees
 from submin.network.outside_messages import Elimination, Message, State, complete, unpacked_state
 from submin.network.whitened_vectors import Vectors
-from submin.storage.network_store import Snapshot
 from submin.storage.problems import DAMAGE, Problem, first_line
 from submin.storage.reconciled import ReconciledStore, read_elimination
+from submin.storage.snapshot import Snapshot
 from submin.tiling.tile_tree import TileTree, TreeNode
 
 Array = NDArray[np.float64]

@@ -14,9 +14,10 @@ from orchestration.progress import Reporter, Silent
 from submin.errors import InputError
 from submin.network.registration import together
 from submin.storage.catalogue_schema import CONTROL_PREFIX
+from submin.storage.commit import begin_change
 from submin.storage.control_blocks import view_id
 from submin.storage.ledger import VIEWS, Entry, Ledger
-from submin.storage.network_store import Snapshot, begin_change
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import writing
 
 

@@ -17,7 +17,7 @@ from submin.simulation.region import RegionDesign, SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
 from submin.storage.catalogue_writer import CatalogueWriter
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 SMALL = RegionDesign(width_km=120, height_km=120, point_spacing_km=9.5)
 """12 triplets, 169 points, 1,052 rays."""

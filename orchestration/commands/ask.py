@@ -15,7 +15,7 @@ from rich.table import Table
 from orchestration.commands.shared import Aoi, Box, Json, check_applies, check_range, out, show
 
 if TYPE_CHECKING:
-    from submin.storage.network_store import Version
+    from submin.storage.repository import Version
 
 app = typer.Typer()
 
@@ -232,7 +232,7 @@ def history(network: Annotated[str, typer.Argument(help="Network.")], as_json: J
 
     Example: submin history network
     """
-    from submin.storage.network_store import versions
+    from submin.storage.repository import versions
 
     found = versions(network)
     values = {

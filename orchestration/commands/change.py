@@ -112,7 +112,7 @@ def run(
     from orchestration.stopping import resumable
     from submin.storage.catalogue import Catalogue
     from submin.storage.dense_reader import is_dense
-    from submin.storage.network_store import Snapshot
+    from submin.storage.snapshot import Snapshot
 
     check_range("--workers", workers, 0, MOST_WORKERS)
     check_range("--batch-blocks", batch_blocks, 1)
@@ -234,8 +234,8 @@ def control_add(
     from orchestration.reconcile import reconcile_changes
     from orchestration.stopping import resumable
     from submin.storage.dense_reader import is_dense
-    from submin.storage.network_store import Snapshot
     from submin.storage.point_table import check_stated_frame, read_point_table
+    from submin.storage.snapshot import Snapshot
 
     table, snapshot = read_point_table(points, "definite"), Snapshot.open(network)
     check_stated_frame(points, snapshot.metadata.frame, snapshot.metadata.epoch)
@@ -275,7 +275,7 @@ def withdraw(
     from orchestration.stopping import resumable
     from orchestration.withdraw import withdraw as take
     from submin.storage.dense_reader import is_dense
-    from submin.storage.network_store import Snapshot
+    from submin.storage.snapshot import Snapshot
 
     if is_dense(Snapshot.open(network)):
         with resumable(network):
@@ -300,7 +300,7 @@ def tag(
 
     Example: submin tag network delivered-2026 --at v12
     """
-    from submin.storage.network_store import tag_version
+    from submin.storage.repository import tag_version
 
     version = tag_version(network, name, at)
     show({"version": version.name, "tags": list(version.tags)}, as_json, f"{network} {version.name} is tagged {name}")

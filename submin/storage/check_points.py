@@ -7,7 +7,7 @@ import zarr
 from numpy.typing import NDArray
 
 from submin.storage.arrays import append_table, create_table, group_of, read_table
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 Ids = NDArray[np.str_]
 

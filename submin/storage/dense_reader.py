@@ -18,7 +18,7 @@ from submin.query.asked import few
 from submin.query.control_set import ControlSet
 from submin.query.spread import spread_rows
 from submin.storage.dense_store import DensePoints, Member, Rows, read_covariance, read_members, read_points
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 FORM = "dense"

@@ -27,8 +27,8 @@ from submin.storage.arrays import (
     table_length,
     write_record,
 )
-from submin.storage.network_store import Snapshot
 from submin.storage.schema import COVARIANCE_CHUNK
+from submin.storage.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.str_]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from submin.query.point_metadata import ImageFacts
 from submin.sensors import SURVEYS
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 
 def image_facts(snapshot: Snapshot) -> ImageFacts:

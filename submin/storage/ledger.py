@@ -12,7 +12,7 @@ import zarr
 from submin.storage.arrays import append_table
 from submin.storage.catalogue_schema import Block
 from submin.storage.control_blocks import point_of_view, points_of
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 UNTESTED = (0.0, 0, 1.0, 0, -1)
 """The columns of a test in a line of a block that was not tested: nothing of it was in the network."""

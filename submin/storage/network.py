@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
-import scipy.sparse as sp
 import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from submin.adjustment.elimination import Sums
-from submin.adjustment.images import ImageSet
 from submin.correlation.compact import AUTO, check_asked, check_size
 from submin.errors import QueryError
 from submin.network.cell import Cell
-from submin.network.network_image import NetworkImage, image_set
-from submin.network.sub_min import CombinedState, SubMin, marginal
 from submin.network.thinning import reported_points
 from submin.query.asked import Asked, few
 from submin.query.control_set import ControlSet
 from submin.query.cross_covariance import PointsOfTile, cross_covariance, points_of_one_tile
-from submin.query.kept import Kept
-from submin.query.outside import UnionState, combined_with_outside, tiles_with_outside
 from submin.query.planner import (
     Answer,
     Selection,
@@ -39,35 +31,20 @@ from submin.query.planner import (
     well_spread,
 )
 from submin.query.point_metadata import PointMetadata, metadata_of_points
-from submin.query.source import NetworkSource
 from submin.storage.accuracy_map import PointAccuracy, accuracy_of, accuracy_of_all, accuracy_of_dense
 from submin.storage.check_points import check_points
 from submin.storage.compact_table import CompactControl, check_suffix, write_compact
 from submin.storage.dense_reader import DenseReader, is_dense, refuse_dense
-from submin.storage.directory import Directory
 from submin.storage.image_facts import image_facts
-from submin.storage.network_store import Snapshot
-from submin.storage.reconciled import ReconciledStore
-from submin.storage.schema import with_joint
+from submin.storage.snapshot import Snapshot
 from submin.storage.tile_view import TileView
 from submin.storage.validity import Validity, today
-from submin.tiling.cover import Cover
+from submin.storage.version_reader import VersionReader
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int32]
-T = TypeVar("T")
-KEPT_CELLS = 256 << 20
-"""Bytes of cells that are kept in memory."""
-KEPT_MERGES = 512 << 20
-"""Bytes of what was made of merged tiles that are kept in memory."""
-IMAGE_PAGE = 64
-"""So many neighbours in the image table are read together."""
-KEPT_IMAGES = 10_000
-PROBED = 200
-"""Up to so many cells are looked for by their names; a list of all of them costs more."""
 
 
-class Network(NetworkSource):
+class Network(VersionReader):
     """One version of a network, read only. It does not change while later versions are written; open it again to see them.
 
     Examples
@@ -87,26 +64,8 @@ class Network(NetworkSource):
         return network
 
     def _begin(self, snapshot: Snapshot) -> None:
-        self._snapshot = snapshot
-        self._cells: Kept[Cell] = Kept(KEPT_CELLS)
-        self._merges: Kept[Any] = Kept(KEPT_MERGES)
-        self._plain_images: dict[int, NetworkImage] = {}
-        self._images: dict[int, NetworkImage] = {}
-        self._exists: dict[int, bool] = {}
-        self._tiles: set[int] = set()
-        self._dense = DenseReader(self._snapshot) if is_dense(self._snapshot) else None
-        self._reconciled = ReconciledStore(snapshot, partial(_as_it_was, snapshot))  # not a method: it would keep the network in memory
-        self._unions: dict[tuple[int, ...], UnionState] = {}
-
-    @property
-    def version(self) -> str:
-        """Name of the version, such as ``v12``."""
-        return self._snapshot.version
-
-    @property
-    def snapshot(self) -> Snapshot:
-        """The version in the store."""
-        return self._snapshot
+        super().__init__(snapshot)
+        self._dense = DenseReader(snapshot) if is_dense(snapshot) else None
 
     @property
     def dense(self) -> DenseReader | None:
@@ -121,7 +80,7 @@ class Network(NetworkSource):
         QueryError
             When there is no such version.
         """
-        return Network(self._snapshot.place, version, parameters)
+        return Network(self.snapshot.place, version, parameters)
 
     def query(
         self,
@@ -254,7 +213,7 @@ class Network(NetworkSource):
             if not selections:
                 asked.refuse_swapped(self.cover)
         elif asked.points is not None:
-            selections, missing = points_named(self, asked.points, self._directory.cells_of(asked.points))
+            selections, missing = points_named(self, asked.points, self.directory.cells_of(asked.points))
             if len(missing):
                 raise QueryError(
                     f"{len(missing)} of {len(asked.points)} points are not in the network or not yet determined by two rays: {few(missing)}"
@@ -289,7 +248,7 @@ class Network(NetworkSource):
         QueryError
             When nothing or too much is asked, a tile or point is unknown, or a box is not one.
         """
-        refuse_dense(self._snapshot, "metadata of points")
+        refuse_dense(self.snapshot, "metadata of points")
         asked = Asked.of(bbox, area, points, tile, one=True)
         if asked.area is not None:
             selections = points_in_area(self, asked.area, every=True)
@@ -298,7 +257,7 @@ class Network(NetworkSource):
         else:
             assert asked.tile is not None
             selections = points_of_tile(self, self.cover.tile_number(asked.tile), every=True)
-        snapshot = self._snapshot
+        snapshot = self.snapshot
         found = metadata_of_points(self, selections, image_facts(snapshot), check_points(snapshot), snapshot.metadata.thinning)
         if asked.area is not None:
             found = found.take(np.asarray(shapely.intersects_xy(asked.area, found.geodetic[:, 0], found.geodetic[:, 1]), dtype=bool))
@@ -315,9 +274,9 @@ class Network(NetworkSource):
         QueryError
             When the network does not have one of them.
         """
-        refuse_dense(self._snapshot, "what is known of single points")
+        refuse_dense(self.snapshot, "what is known of single points")
         ids = np.unique(np.asarray(points, dtype=np.str_))
-        selections, missing = points_named(self, ids, self._directory.cells_of(ids), every=True)
+        selections, missing = points_named(self, ids, self.directory.cells_of(ids), every=True)
         if len(missing):
             raise QueryError(f"{len(missing)} of {len(ids)} points are not in the network: {few(missing)}; expected ids of its points")
         return selections
@@ -325,15 +284,15 @@ class Network(NetworkSource):
     @cached_property
     def validity(self) -> Validity:
         """From when to when points are valid."""
-        return Validity.of(self._snapshot)
+        return Validity.of(self.snapshot)
 
     def left_by_thinning(self, cell: Cell) -> NDArray[np.bool_]:
         """True (n,) for the points of a cell that thinning leaves in answers for areas and tiles."""
-        return reported_points(cell, self.cover, self._snapshot.metadata.thinning)
+        return reported_points(cell, self.cover, self.snapshot.metadata.thinning)
 
     def _reported(self, selections: Sequence[Selection], on: date) -> list[Selection]:
         """Those of some points that are not thinned, and valid on a day."""
-        if not self._snapshot.metadata.thinning and not len(self.validity):
+        if not self.snapshot.metadata.thinning and not len(self.validity):
             return list(selections)
         kept = []
         for s in selections:
@@ -362,7 +321,7 @@ class Network(NetworkSource):
         if self._dense is not None:
             held = self._dense.held(ids)
             return {0: held} if len(held) else {}
-        selections, _ = points_named(self, ids, self._directory.cells_of(ids))
+        selections, _ = points_named(self, ids, self.directory.cells_of(ids))
         return {s.cell.number: s.cell.point_ids[s.rows] for s in selections}
 
     def cross_covariance(
@@ -384,7 +343,7 @@ class Network(NetworkSource):
         QueryError
             When a tile does not hold a point, or a point is not determined.
         """
-        refuse_dense(self._snapshot, "a covariance between tiles")
+        refuse_dense(self.snapshot, "a covariance between tiles")
         first, second = (
             self._points_of_tile(self.cover.tile_number(tile), np.asarray(ids, dtype=np.str_))
             for tile, ids in ((one, ids_one), (other, ids_other))
@@ -392,111 +351,15 @@ class Network(NetworkSource):
         return cross_covariance(self, first, second)
 
     def _points_of_tile(self, tile: int, ids: NDArray[np.str_]) -> PointsOfTile:
-        return points_of_one_tile(self, tile, ids, self._directory.cells_of(np.unique(ids)))
+        return points_of_one_tile(self, tile, ids, self.directory.cells_of(np.unique(ids)))
 
     def tile(self, name: str) -> TileView:
         """One sub-MIN alone."""
         return TileView(self, self.cover.tile_number(name))
 
-    @property
-    def cover(self) -> Cover:
-        """Tiles and cells."""
-        return self._snapshot.cover
-
-    def cell_numbers(self) -> tuple[int, ...]:
-        """Cells that hold points, ascending."""
-        return self._numbers
-
-    @cached_property
-    def _numbers(self) -> tuple[int, ...]:
-        return self._snapshot.cell_numbers()
-
-    def existing(self, numbers: Sequence[int]) -> tuple[int, ...]:
-        """Those of some cells that hold points, in their order."""
-        unknown = [number for number in numbers if number not in self._exists]
-        there = set(self._snapshot.existing_cells(unknown) if len(unknown) <= PROBED else self.cell_numbers())
-        self._exists.update((number, number in there) for number in unknown)
-        return tuple(number for number in numbers if self._exists[number])
-
-    def cell(self, number: int) -> Cell:
-        """A cell without its sums; the latest used ones are kept in memory."""
-        return self.some_cells([number])[0]
-
-    def some_cells(self, numbers: Sequence[int]) -> list[Cell]:
-        """Cells without their sums; those that are not in memory are read side by side."""
-        found = {number: cell for number in numbers if (cell := self._cells.get(number)) is not None}
-        unread = [number for number in numbers if number not in found]
-        for number, cell in zip(unread, self._snapshot.cells(unread, with_sums=False) if unread else (), strict=True):
-            found[number] = self._cells.put(number, cell)
-        return [found[number] for number in numbers]
-
-    def cell_sums(self, number: int) -> tuple[Index, Sums]:
-        """A cell's images and sums."""
-        return self.some_sums([number])[0]
-
-    def some_sums(self, numbers: Sequence[int]) -> list[tuple[Index, Sums]]:
-        """Images and sums of cells, read side by side."""
-        return self._snapshot.some_sums(numbers)
-
-    def kept(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What was made of this version under a key before, or else is made now; the latest used are kept in memory."""
-        found: T | None = self._merges.get(key)
-        return self._merges.put(key, make()) if found is None else found
-
-    def sub_min(self, tile: int, images: Index | None) -> SubMin:
-        """A tile's sub-MIN, or its marginal on some images; of a tile that is asked for again the whole is kept in memory."""
-        whole: SubMin | None = self._merges.get(("tile", tile))
-        if whole is None:
-            if tile not in self._tiles and not self._snapshot.has_tile(tile):
-                raise QueryError(f"tile {self.cover.tile_name(tile)} holds nothing yet; see 'submin info'")
-            if images is None or tile not in self._tiles:
-                self._tiles.add(tile)
-                return self._snapshot.sub_min(tile, images)
-            whole = self._merges.put(("tile", tile), self._snapshot.sub_min(tile))
-        return whole if images is None else marginal(whole, images)
-
-    def with_outside(self, tiles: Sequence[int], images: Index) -> SubMin | None:
-        """State of some images from tiles and all that lies outside of them; None where the network cannot tell."""
-        return tiles_with_outside(self, self._reconciled, tiles, images, self._unions) if self._reconciled else None
-
-    def combined_with_outside(self, tiles: Sequence[int], images: Index, loading: sp.csr_array) -> CombinedState | None:
-        """State of some images and the covariance of combinations of them; see `submin.query.outside.combined_with_outside`."""
-        return combined_with_outside(self, self._reconciled, tiles, images, loading) if self._reconciled else None
-
-    def image_set(self, rows: Sequence[int] | Index) -> ImageSet:
-        """Images of these rows; the latest asked for are kept in memory."""
-        if len(self._plain_images) > KEPT_IMAGES:
-            self._plain_images.clear()
-            self._images.clear()
-        unread = [int(row) for row in rows if int(row) not in self._images]
-        pages = {row // IMAGE_PAGE for row in unread if row not in self._plain_images}
-        if pages:  # neighbours are asked for next, and lie in the chunks that are read anyway
-            near = np.concatenate([np.arange(IMAGE_PAGE * page, IMAGE_PAGE * (page + 1)) for page in sorted(pages)])
-            near = near[near < self._snapshot.image_count()]
-            self._plain_images.update(zip(near.tolist(), self._snapshot.plain_images(near), strict=True))
-        images = with_joint(self._snapshot.root, [self._plain_images[row] for row in unread])
-        self._images.update(zip(unread, images, strict=True))
-        return image_set([self._images[int(row)] for row in rows], self._snapshot.metadata.ellipsoid, self._snapshot.metadata.parameters)
-
-    @cached_property
-    def _blocks(self) -> NDArray[np.str_]:
-        """Block of every image."""
-        return np.asarray(self._snapshot.image_columns(["block_id"])["block_id"], dtype=np.str_)
-
-    def _blocks_of(self, images: Index) -> tuple[str, ...]:
-        """Blocks, ascending, of some images (rows); rows beyond the network's have none."""
-        rows = images.tolist()
-        if all(row in self._plain_images for row in rows):  # those of a small question, which it has read: the table is not
-            return tuple(sorted({self._plain_images[row].block_id for row in rows}))
-        return tuple(np.unique(self._blocks[images[images < len(self._blocks)]]).tolist())
-
-    @cached_property
-    def _directory(self) -> Directory:
-        return self._snapshot.directory()
-
     def control_set(self, found: Answer) -> ControlSet:
         """An answer as users get it; images behind it that are not in the network have no block there."""
-        metadata, cover = self._snapshot.metadata, self.cover
+        metadata, cover = self.snapshot.metadata, self.cover
         return ControlSet(
             ids=found.ids,
             geocentric=found.geocentric,
@@ -509,15 +372,10 @@ class Network(NetworkSource):
             tile_of_point=np.array([cover.tile_name(t) for t in found.owner], dtype=np.str_),
             rays=found.rays,
             version=self.version,
-            blocks=self._blocks_of(found.images),
+            blocks=self.blocks_of(found.images),
             scope="network" if found.network_wide else "tiles",
             validity=self.validity.intervals(found.ids),
         )
-
-
-def _as_it_was(snapshot: Snapshot, version: int) -> Network:
-    """The network of a version as it was at an earlier one, with as many parameters an image."""
-    return Network(snapshot.place, f"v{version}", snapshot.metadata.parameters)
 
 
 def open_network(path: str | Path, version: str | None = None) -> Network:

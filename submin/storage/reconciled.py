@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from submin.network.outside_messages import Elimination, State, unpacked_state
 from submin.network.whitened_vectors import PASS, Vectors, WholeImages, vectors_of
 from submin.query.kept import Kept
-from submin.query.outside import TileState, TreeState, other_priors
+from submin.query.outside import other_priors
+from submin.query.reconciled_state import TileState, TreeState
 from submin.query.source import NetworkSource
 from submin.storage.arrays import (
     PLAIN,
@@ -34,8 +35,8 @@ from submin.storage.arrays import (
     replace_table,
     write_record,
 )
-from submin.storage.network_store import Snapshot
 from submin.storage.schema import read_symmetric, write_symmetric
+from submin.storage.snapshot import Snapshot
 from submin.tiling.tile_tree import TileTree
 
 Array = NDArray[np.float64]
@@ -200,7 +201,7 @@ def note_changes(root: zarr.Group, base: Snapshot, version: int, changes: Change
 
 
 class ReconciledStore:
-    """What a version keeps of its reconciliations, as queries ask for it (`submin.query.outside.Reconciled`)."""
+    """What a version keeps of its reconciliations, as queries ask for it (`submin.query.reconciled_state.Reconciled`)."""
 
     def __init__(self, snapshot: Snapshot, earlier: Callable[[int], NetworkSource]) -> None:
         """``earlier`` opens the network as it was at a version."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from submin.errors import InputError
 from submin.storage.arrays import append_table, create_table, group_of, read_table
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 Texts = NDArray[np.str_]
 Flags = NDArray[np.bool_]

@@ -17,8 +17,8 @@ from submin.network.dense_sub_min import DenseSubMin
 from submin.network.pending import DenseNetwork
 from submin.storage.dense_store import Member, read_members, read_points, read_state
 from submin.storage.ledger import Entry
-from submin.storage.network_store import Snapshot
 from submin.storage.problems import DAMAGE, Problem, first_line, some
+from submin.storage.snapshot import Snapshot
 from submin.storage.verify_tables import verify_history
 from submin.storage.verify_tile import TileHealth
 

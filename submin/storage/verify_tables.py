@@ -12,9 +12,11 @@ from submin.errors import SubminError
 from submin.network.network_image import image_set
 from submin.storage.arrays import group_of, read_table
 from submin.storage.ledger import Entry
-from submin.storage.network_store import Snapshot, summed_cells, versions
 from submin.storage.problems import DAMAGE, Problem, first_line, some
+from submin.storage.ray_totals import summed_cells
+from submin.storage.repository import versions
 from submin.storage.schema import FLAG_COLUMNS, IMAGE_COLUMNS, LEDGER_COLUMNS
+from submin.storage.snapshot import Snapshot
 from submin.storage.verify_tile import CellContents
 from submin.tiling.cover import Cover
 

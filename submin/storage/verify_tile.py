@@ -23,9 +23,9 @@ from submin.network.sub_min import SubMin, add_sums, factor, wider
 from submin.network.variance_factor import Fits, Kind, fits
 from submin.query.planner import DETERMINED_METRES
 from submin.storage.arrays import attributes_of, group_of, hash_ids, read_matrix, read_record
-from submin.storage.network_store import Snapshot
 from submin.storage.problems import DAMAGE, Problem, first_line, some
 from submin.storage.schema import determined, read_cell
+from submin.storage.snapshot import Snapshot
 from submin.tiling.cover import Cover
 
 Array = NDArray[np.float64]

@@ -1,7 +1,7 @@
 """One writer at a time: a lock on a network in a folder, that ends with the process that holds it.
 
 The operating system holds the lock (``flock`` on a file in the folder), so a writer that is killed leaves none behind. The file itself
-stays and means nothing by itself. Object stores have no such lock; there the commit decides (`submin.storage.network_store.commit`).
+stays and means nothing by itself. Object stores have no such lock; there the commit decides (`submin.storage.commit`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from submin.errors import BusyError, StoreError
-from submin.storage.network_store import Snapshot, clear_write_errors, write_error
 from submin.storage.place import is_remote
+from submin.storage.repository import clear_write_errors, write_error
+from submin.storage.snapshot import Snapshot
 
 LOCK_FILE = "writer.lock"
 NO_LOCKS_HERE = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)

@@ -27,8 +27,8 @@ from orchestration.create import create
 from orchestration.executors import SerialExecutor
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata
-from submin.storage.network_store import tag_version
 from submin.storage.point_table import read_point_table
+from submin.storage.repository import tag_version
 
 ROOT = Path(__file__).parents[2]
 BOX = ["--bbox", 99, 34, 101, 36]

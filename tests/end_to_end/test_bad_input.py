@@ -30,8 +30,9 @@ from orchestration.run import run
 from submin.query.warm_up import compile_kernels
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.repository import versions
 from submin.storage.simulated import write_region
+from submin.storage.snapshot import Snapshot
 
 TINY = RegionDesign(width_km=60, height_km=60, point_spacing_km=9.5)
 """4 triplets, 36 points, 300 rays about 100 degrees east, 35 degrees north."""

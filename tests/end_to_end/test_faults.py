@@ -31,7 +31,7 @@ from orchestration.reconcile import reconcile
 from orchestration.run import run
 from submin.errors import BusyError, ClusterError, ConflictError, StoreError
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import LOCK_FILE, writing
 
 SEED = 20260601

@@ -24,7 +24,8 @@ from orchestration.run import run
 from orchestration.withdraw import withdraw
 from submin.errors import ConflictError
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.repository import versions
+from submin.storage.snapshot import Snapshot
 
 BUCKET = "networks"
 KEYS = {"AWS_ACCESS_KEY_ID": "someone", "AWS_SECRET_ACCESS_KEY": "secret"}

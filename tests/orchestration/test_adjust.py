@@ -27,7 +27,7 @@ from submin.simulation.region import RegionDesign, SimulatedRegion, simulate_reg
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
-from submin.storage.network_store import versions
+from submin.storage.repository import versions
 from submin.storage.simulated import write_region
 from tests.orchestration.test_mixed_sensors import with_frames
 

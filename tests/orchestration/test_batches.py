@@ -20,7 +20,8 @@ from orchestration.run import run
 from submin.errors import CatalogueError
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.repository import versions
+from submin.storage.snapshot import Snapshot
 
 
 def test_every_ray_is_in_one_cell(region: SimulatedRegion, base: Path) -> None:

@@ -38,9 +38,9 @@ from submin.storage.catalogue_schema import PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
 from submin.storage.control_blocks import observed_positions
 from submin.storage.ledger import Ledger
-from submin.storage.network_store import Snapshot
 from submin.storage.point_table import read_point_table
 from submin.storage.simulated import write_region
+from submin.storage.snapshot import Snapshot
 
 HERE = SerialExecutor()
 DESIGN = RegionDesign(width_km=80, height_km=80, point_spacing_km=9.5)

@@ -33,9 +33,11 @@ from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata, PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
+from submin.storage.commit import commit
 from submin.storage.dense_store import read_state
 from submin.storage.network import Network
-from submin.storage.network_store import Snapshot, commit, versions
+from submin.storage.repository import versions
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import writing
 
 Array = NDArray[np.float64]

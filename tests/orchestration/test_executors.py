@@ -22,7 +22,8 @@ from networks import SMALL, area_of, fuse
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from orchestration import local_cluster
-from orchestration.executors import STREAMED, DaskExecutor, SerialExecutor, ThreadExecutor, executor_for
+from orchestration.dask_executor import DaskExecutor
+from orchestration.executors import STREAMED, SerialExecutor, ThreadExecutor, executor_for
 from orchestration.read_ahead import batches_ahead
 from submin.errors import ClusterError, InputError, KilledTaskError
 from submin.simulation.region import simulate_region

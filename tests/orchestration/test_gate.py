@@ -26,7 +26,7 @@ from submin.query.block_innovation import common_points
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 HERE = SerialExecutor()
 LAST = 7

@@ -19,7 +19,8 @@ from submin.geodesy import geocentric_to_geodetic
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
-from submin.storage.network_store import Snapshot, create_network, versions
+from submin.storage.repository import create_network, versions
+from submin.storage.snapshot import Snapshot
 
 HERE = SerialExecutor()
 LIMIT = 100  # parameters: 16 images

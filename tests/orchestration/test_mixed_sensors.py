@@ -22,7 +22,7 @@ from submin.sensors import Ground, sensor_named
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, ImageRecord
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 FRAME = sensor_named("frame")
 PIXELS = 24_000

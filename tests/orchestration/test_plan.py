@@ -25,7 +25,7 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CONTROL_PREFIX
 from submin.storage.catalogue_writer import CatalogueWriter
 from submin.storage.ledger import Ledger
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 
 def made(path: Path, area: shapely.Geometry, catalogue: Path, **options: object) -> str:

@@ -31,8 +31,9 @@ from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
 from submin.storage.catalogue_writer import CatalogueWriter
 from submin.storage.check_points import check_points
-from submin.storage.network_store import Snapshot, versions
+from submin.storage.repository import versions
 from submin.storage.simulated import write_region
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import writing
 
 EVERYWHERE = (90.0, 30.0, 110.0, 40.0)

@@ -17,10 +17,9 @@ import submin
 from submin.network.cell import Cell
 from submin.query.control_set import ControlSet
 from submin.simulation.region import simulate_region
-from submin.storage import accuracy_map
-from submin.storage import network as module
-from submin.storage.network_store import Snapshot
+from submin.storage import accuracy_map, version_reader
 from submin.storage.simulated import write_region
+from submin.storage.snapshot import Snapshot
 
 EVERYWHERE = (90.0, 30.0, 110.0, 40.0)
 
@@ -119,7 +118,7 @@ def test_merged_tiles_are_kept_for_the_next_question(place: Path, policy: str, m
 @pytest.mark.parametrize("name", ["KEPT_CELLS", "KEPT_MERGES", "KEPT_IMAGES", "PROBED"])
 def test_what_is_kept_does_not_change_an_answer(place: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     usual = submin.open(place)
-    monkeypatch.setattr(module, name, 0)
+    monkeypatch.setattr(version_reader, name, 0)
     without = submin.open(place)
     questions: list[dict[str, Any]] = [
         {"bbox": inner_box(usual)}, {"bbox": EVERYWHERE, "policy": "rigorous"}, {"tile": "r001c001"},

@@ -23,7 +23,8 @@ from submin.storage.arrays import append_table, array_of, attributes_of, group_o
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import CatalogueMetadata
 from submin.storage.catalogue_writer import CatalogueWriter
-from submin.storage.network_store import Snapshot, begin_change, commit
+from submin.storage.commit import begin_change, commit
+from submin.storage.snapshot import Snapshot
 
 Root = zarr.Group
 

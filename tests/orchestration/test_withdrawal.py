@@ -20,8 +20,11 @@ from submin.errors import BusyError, InputError
 from submin.simulation.region import SimulatedRegion
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
+from submin.storage.commit import begin_change, commit
 from submin.storage.ledger import Ledger, blocks_in
-from submin.storage.network_store import Snapshot, begin_change, commit, summed_cells, versions
+from submin.storage.ray_totals import summed_cells
+from submin.storage.repository import versions
+from submin.storage.snapshot import Snapshot
 from submin.storage.writer_lock import writing
 
 HERE = SerialExecutor()

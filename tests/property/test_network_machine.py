@@ -34,8 +34,9 @@ from submin.errors import InputError
 from submin.simulation.region import RegionDesign, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
-from submin.storage.network_store import Snapshot, create_network
+from submin.storage.repository import create_network
 from submin.storage.simulated import write_region
+from submin.storage.snapshot import Snapshot
 
 DESIGN = RegionDesign(
     width_km=60, height_km=60, point_spacing_km=9.5, blunder_rate=0.0, bad_cameras=0, seed=5,

@@ -24,8 +24,8 @@ from submin.network.thinning import one_a_square, reported_points
 from submin.simulation.region import RegionDesign, SimulatedRegion, simulate_region
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block
-from submin.storage.network_store import Snapshot
 from submin.storage.simulated import write_region
+from submin.storage.snapshot import Snapshot
 
 EVERYWHERE = (90.0, 30.0, 110.0, 40.0)
 SIDE = 14_000.0

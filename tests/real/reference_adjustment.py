@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
 from submin.sensors import Ground, sensor_named
-from submin.storage.network_store import Snapshot
+from submin.storage.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
