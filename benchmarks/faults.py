@@ -279,7 +279,7 @@ def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None
                 shutil.rmtree(scene.folder / name)
                 continue
             rows.append({"kill": len(rows) + 1, "seed": seed, **done.to_row()})
+            if out is not None:
+                write_record(out, "faults", scale, workers, rows)
             say.print(", ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in rows[-1].values()), soft_wrap=True)
-    if out is not None:
-        write_record(out, "faults", scale, workers, rows)
     return rows

@@ -37,8 +37,15 @@ def measure(scale: float, workers: int, out: Path | None = None) -> Rows:
     """Rows of each part of China (times ``scale``) on so many workers, of `ALONE` on one too, and of what is asked for.
 
     One worker has all cores, of which the coordinator then takes a second one, and once a single core for both. Runs on several workers
-    come before and after, since the machine changes. ``out``: folder for ``scaling.json``.
+    come before and after, since the machine changes. Every reconciliation has all cores. ``out``: folder for ``scaling.json``.
+
+    Raises
+    ------
+    ValueError
+        When there are no several workers to compare with one.
     """
+    if workers < 2:
+        raise ValueError(f"workers is {workers}; expected two or more, to compare with one")
     ran: dict[float, Rows] = {}
     for part in PARTS:
         with tempfile.TemporaryDirectory() as folder:

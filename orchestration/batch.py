@@ -101,7 +101,7 @@ def fuse_batch(
     """
     session, base = begin_change(where, version, known)
     come, refused = _sorted_out(batch, base.metadata.ellipsoid, executor)
-    directory = base.directory_of(np.concatenate([np.empty(0, dtype="U1"), *(one.block.points[0] for one in come)]))
+    directory = base.directory_of(_points_of(come))
     tests, against = _tests(come, base, directory, executor, reporter)
     against |= {name: test.reason(innovation, base.version) for name, test in tests.items() if test.rejected(innovation)}
     come, move = _register(come, against, base, directory, refused, executor)
@@ -136,6 +136,11 @@ def fuse_batch(
         version, tuple(blocks), tuple(refused), doubtful, settled.flagged, settled.contradicted,
         tuple(r.tile for r in settled.reports), tuple(r.tile for r in settled.reports if not r.converged),
     )  # fmt: skip
+
+
+def _points_of(batch: Sequence[Incoming]) -> NDArray[np.str_]:
+    """Ids of the points of all blocks, those of neighbours several times."""
+    return np.concatenate([np.empty(0, dtype="U1"), *(come.block.points[0] for come in batch)])
 
 
 def _unsaid(refused: Sequence[Rejected], base: Snapshot) -> list[Rejected]:

@@ -90,8 +90,8 @@ class Relocations:
         left = np.repeat(np.array(list(out.departures), dtype=np.int64), [len(of_cell) for of_cell in out.departures.values()])
         if not len(left):
             return cls(left, left, np.full(len(ids), -1, dtype=np.int64))
-        known, place = numbered(np.concatenate([ids, *out.departures.values()]))
-        arriving, leaving = place[: len(ids)], place[len(ids) :]
+        known, number = numbered(np.concatenate([ids, *out.departures.values()]))
+        arriving, leaving = number[: len(ids)], number[len(ids) :]
         to, come_from = np.full(len(known), -1, dtype=np.int64), np.full(len(known), -1, dtype=np.int64)
         to[arriving], come_from[leaving] = at, left
         return cls(left, to[leaving], come_from[arriving])
@@ -270,8 +270,8 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     arrivals, departures = move.registration.arrivals, move.out.departures
     tiles = _touched_tiles(cover, move.out, move.registration)
     shared = executor.share(list(move.images))
-    moves = move.relocations
-    origins = _origins(moves.left, moves.goes)
+    relocated = move.relocations
+    origins = _origins(relocated.left, relocated.goes)
     arguments = []
     # the largest first: at the end no worker is left with much to do while others wait
     for tile in sorted(tiles, key=lambda tile: -sum(len(arrivals[c].image) for c in move.cover.cells_held(tile) if c in arrivals)):
@@ -309,7 +309,7 @@ def settle(session: icechunk.Session, base: Snapshot, move: Move, executor: Exec
     no_more = {done.tile for done in factored if not done.images} | (split - {*base.cover.splits})
     gone += [f"{group}/{base.cover.tile_name(tile)}" for tile in sorted(no_more) for group in ("tiles", TILE_STATES)]
     rejected = _rejected_rays((c for r in reports for c in r.cells.values()), base.image_count() + len(move.images))
-    changes = _changes(base, move, reports, origins, moves.left[moves.goes < 0])
+    changes = _changes(base, move, reports, origins, relocated.left[relocated.goes < 0])
     return Settled(tuple(reports), changes, frozenset(flags), tuple(gone), rejected)
 
 
@@ -366,7 +366,9 @@ def finish(
     note_changes(root, base, version, settled.changes)
     append_entries(group_of(root, "ledger"), entries)
     ids, at = move.registration.directory
-    listed = (at >= 0) & (move.relocations.before != at)
+    # what is withdrawn is found by a look into cells, so a wrong entry is mended; what comes was found by the directory itself
+    entered = base.candidate_cells(ids) if len(withdrawn) else move.relocations.before
+    listed = (at >= 0) & (entered != at)
     append_table(group_of(root, "directory"), {"hash": hash_ids(ids[listed]), "cell": at[listed]})
     metadata = replace(base.metadata, cover=move.cover.to_mapping(), parameters=move.parameters)
     if metadata != base.metadata:

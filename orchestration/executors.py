@@ -1,4 +1,4 @@
-"""Where tasks run: here, one after another, or on a Dask cluster. The same tasks, the same results."""
+"""Where tasks run: here, one after another or in threads, or on a Dask cluster. The same tasks, the same results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from threadpoolctl import ThreadpoolController
 
@@ -21,7 +21,6 @@ from submin.errors import InputError
 STREAMED = 4
 """Results of a stream that a worker may be ahead of whoever takes them."""
 Advance = Callable[[], None]
-T = TypeVar("T")
 
 
 class Executor(Protocol):

@@ -221,7 +221,7 @@ def fuse_blocks(
     with writing(place), ThreadPoolExecutor(1, thread_name_prefix="directory") as beside:
         known: Snapshot | None
         before = known = Snapshot.open(place)
-        directory = beside.submit(before.directory)  # while the ledger and the first blocks are read
+        directory = beside.submit(before.read_ahead)  # while the ledger and the first blocks are read
         tally = Tally(before.number, {row for _, row in before.flags()})
         new = _new_blocks(blocks, Ledger.of(before), tally, reporter)
         del before

@@ -18,7 +18,6 @@ from submin.storage.commit import begin_change, commit
 from submin.storage.schema import write_cell
 from submin.storage.snapshot import Snapshot
 
-Root = zarr.Group
 Found = tuple[str, str]
 """Kind of a problem, and the tile that must be named."""
 

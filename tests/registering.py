@@ -11,7 +11,7 @@ from hypothesis import Phase, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from orchestration.change import TakenOut, take_points, take_points_seen
+from orchestration.change import Relocations, TakenOut, take_points, take_points_seen
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
@@ -144,7 +144,8 @@ class Fused:
                 assert not len(cell.images) and not len(cell.rays)
                 del self.cells[number]
         ids, cells = registration.directory
-        self.directory |= {str(i): int(c) for i, c in zip(ids, cells, strict=True) if c >= 0}
+        listed = (cells >= 0) & (cells != Relocations.of(out, registration).before)
+        self.directory |= {str(i): int(c) for i, c in zip(ids[listed], cells[listed], strict=True)}
         return registration
 
     def cell_of(self, point: str) -> tuple[Cell, int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -32,22 +34,25 @@ def _letters(ids: NDArray[np.str_]) -> tuple[NDArray[np.unsignedinteger], NDArra
     return encoded.view(np.uint8).reshape(len(ids), -1), np.char.str_len(encoded)
 
 
-def look_up(entries: NDArray[np.uint64], values: NDArray[np.int64], wanted: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """The value (n,) of the last entry of each wanted hash (ascending), -1 where there is none; ``entries`` (k,) are in any order."""
+def look_up(pieces: Iterable[tuple[NDArray[np.uint64], NDArray[np.int64]]], wanted: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """The value (n,) of the last entry of each wanted hash (ascending), -1 where there is none.
+
+    Entries come in pieces, hashes (k,) and values (k,) of each, in any order of hashes.
+    """
     found = np.full(len(wanted), -1, dtype=np.int64)
-    _look_up(entries, values, wanted, min(1 << (SIEVE * len(wanted)).bit_length(), LARGEST_SIEVE), found)
+    sieve = np.zeros(min(1 << (SIEVE * len(wanted)).bit_length(), LARGEST_SIEVE), dtype=np.bool_)
+    sieve[wanted & np.uint64(len(sieve) - 1)] = True
+    for entries, values in pieces:
+        _look_up(entries, values, wanted, sieve, found)
     return found
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look_up(
-    entries: NDArray[np.uint64], values: NDArray[np.int64], wanted: NDArray[np.uint64], places: int, found: NDArray[np.int64]
+    entries: NDArray[np.uint64], values: NDArray[np.int64], wanted: NDArray[np.uint64], sieve: NDArray[np.bool_], found: NDArray[np.int64]
 ) -> None:
     """Nearly all entries are of hashes that nobody wants, and one look at a few of their bits tells."""
-    bits = np.uint64(places - 1)
-    sieve = np.zeros(places, np.bool_)
-    for k in range(len(wanted)):
-        sieve[wanted[k] & bits] = True
+    bits = np.uint64(len(sieve) - 1)
     for k in range(len(entries)):
         if sieve[entries[k] & bits]:
             at = np.searchsorted(wanted, entries[k])

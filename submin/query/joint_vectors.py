@@ -15,7 +15,6 @@ from submin.network.outside_messages import carried, carried_together
 from submin.query.reconciled_state import Reconciled
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int32]
 Names = NDArray[np.int64]
 
 

@@ -20,9 +20,7 @@ from submin.query.joint_vectors import Functionals, joint, parameter_rows, summe
 from submin.query.reconciled_state import Reconciled, TileState, TreeState
 from submin.query.source import NetworkSource
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int32]
-Names = NDArray[np.int64]
 
 
 def tiles_with_outside(

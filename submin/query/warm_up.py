@@ -49,7 +49,7 @@ def compile_kernels() -> None:
     loadings([GroundPart(ground, linear, point_factors(linear, np.ones(4)))], np.arange(2, dtype=np.int32), images.parameters)
     unpacked(packed(np.eye(2)))
     spread_rows(np.arange(6.0).reshape(3, 2), np.ones(3), np.array(["a", "b", "c"]), 2)
-    look_up(hash_ids(np.array(["a"])), np.zeros(1, dtype=np.int64), hash_ids(np.array(["a"])))
+    look_up([(hash_ids(np.array(["a"])), np.zeros(1, dtype=np.int64))], hash_ids(np.array(["a"])))
     variances_of(np.eye(2, order="F"), sp.eye_array(2, format="csr"))
     # the sums of a tile are large and sparse, which those of two images are not
     many = DENSE_SIZE + 1

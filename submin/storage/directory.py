@@ -25,12 +25,9 @@ class Directory:
 
     @classmethod
     def of_points(cls, pieces: Iterable[Directory], point_ids: NDArray[np.str_]) -> Directory:
-        """What a directory says of some points. It comes in pieces, in the order of its entries, and no two need be in memory at a time."""
+        """What a directory says of some points. It comes in pieces, in the order of its entries, and need not be in memory as a whole."""
         wanted = np.unique(hash_ids(point_ids))
-        cell = np.full(len(wanted), -1, dtype=np.int64)
-        for piece in pieces:
-            later = look_up(piece.hash, piece.cell, wanted)
-            np.copyto(cell, later, where=later >= 0)
+        cell = look_up(((piece.hash, piece.cell) for piece in (pieces if len(wanted) else ())), wanted)
         return cls(wanted[cell >= 0], cell[cell >= 0])
 
     def __len__(self) -> int:
@@ -41,4 +38,4 @@ class Directory:
         if not len(self.hash) or not len(point_ids):
             return np.full(len(point_ids), -1, dtype=np.int64)
         wanted, inverse = np.unique(hash_ids(point_ids), return_inverse=True)
-        return look_up(self.hash, self.cell, wanted)[inverse]
+        return look_up([(self.hash, self.cell)], wanted)[inverse]

@@ -52,6 +52,8 @@ from submin.tiling.cover import Cover
 READ_OVER_ROWS = 32
 DIRECTORY_PIECE = 16 * TABLE_CHUNK
 """Entries of the directory that are looked through at a time."""
+DIRECTORY_AHEAD = 8 * DIRECTORY_PIECE
+"""Entries, 128 MB, of the largest directory that is read before it is known what will be asked of it."""
 
 
 @lru_cache(maxsize=4)
@@ -61,7 +63,7 @@ def _cover(text: str) -> Cover:
 
 
 class Snapshot:
-    """One version of a network, read only. Everything is read when asked for; only names, flags and the directory are kept."""
+    """One version of a network, read only. Everything is read when asked for; only names, flags and what `directory` gives are kept."""
 
     def __init__(self, root: zarr.Group, place: str, cover: Cover | None = None, parameters: int = 0) -> None:
         """``cover`` and ``parameters`` are those of the version being made: its tiles may be finer, its images may need more parameters."""
@@ -228,7 +230,7 @@ class Snapshot:
         return self.directory_of(point_ids).cells_of(point_ids)
 
     def directory_of(self, point_ids: NDArray[np.str_]) -> Directory:
-        """What the directory says of some points: in memory is a piece of it at a time, however many points the network has."""
+        """What the directory says of some points: it is looked through piece by piece, however many points the network has."""
         return Directory.of_points(self._directory_pieces(), point_ids)
 
     def _directory_pieces(self) -> Iterator[Directory]:
@@ -242,6 +244,11 @@ class Snapshot:
     def directory(self) -> Directory:
         """The directory of all points, 16 bytes each; it is kept."""
         return self._directory
+
+    def read_ahead(self) -> None:
+        """Read and keep the directory, where it is no more than `DIRECTORY_AHEAD` entries: whoever asks for points then need not wait."""
+        if table_length(group_of(self.root, "directory")) <= DIRECTORY_AHEAD:
+            self.directory()
 
     @cached_property
     def _directory(self) -> Directory:

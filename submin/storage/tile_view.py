@@ -66,7 +66,7 @@ class TileView:
             image_set(images, opened.snapshot.metadata.ellipsoid, opened.snapshot.metadata.parameters), block.point_ids, block.image,
             block.observed, block.sigma,
         )  # fmt: skip
-        elsewhere = ids[opened.snapshot.candidate_cells(ids) >= 0]
+        elsewhere = ids[opened.directory.cells_of(ids) >= 0]
         return TilePreview(opened, with_block(opened, self._number, rays, elsewhere, opened.snapshot.image_count()))
 
 

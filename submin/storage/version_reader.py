@@ -26,7 +26,6 @@ from submin.storage.schema import with_joint
 from submin.storage.snapshot import Snapshot
 from submin.tiling.cover import Cover
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 T = TypeVar("T")
 KEPT_CELLS = 256 << 20
@@ -41,15 +40,10 @@ PROBED = 200
 
 
 class VersionReader(NetworkSource):
-    """One version of a network, read only, behind the questions that are put to it.
-
-    Attributes
-    ----------
-    snapshot : the version in the store
-    """
+    """One version of a network, read only, behind the questions that are put to it."""
 
     def __init__(self, snapshot: Snapshot) -> None:
-        self.snapshot = snapshot
+        self._snapshot = snapshot
         self._cells: Kept[Cell] = Kept(KEPT_CELLS)
         self._merges: Kept[Any] = Kept(KEPT_MERGES)
         self._plain_images: dict[int, NetworkImage] = {}
@@ -58,6 +52,11 @@ class VersionReader(NetworkSource):
         self._tiles: set[int] = set()
         self._reconciled = ReconciledStore(snapshot, partial(_as_it_was, snapshot))  # not a method: it would keep this in memory
         self._unions: dict[tuple[int, ...], UnionState] = {}
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The version in the store."""
+        return self._snapshot
 
     @property
     def version(self) -> str:

@@ -9,15 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from damages import Store
 from networks import area_of, fuse, rewrite, same_network
 
 import submin
 from orchestration.control import add_control
 from orchestration.executors import SerialExecutor
 from orchestration.info import describe
+from orchestration.run import run
+from orchestration.verify import verify
 from orchestration.withdraw import withdraw
 from submin.errors import BusyError, InputError
 from submin.simulation.region import SimulatedRegion
+from submin.storage.arrays import group_of, hash_ids, read_table, set_rows
 from submin.storage.catalogue import Catalogue
 from submin.storage.catalogue_schema import Block, PointTable
 from submin.storage.commit import begin_change, commit
@@ -191,3 +195,20 @@ def test_twice_is_once(base: Path, blocks: list[Block]) -> None:
         withdraw(str(base), HERE, block=blocks[0].block_id)
     with pytest.raises(InputError, match="is not in the network"):
         withdraw(str(base), HERE, image=blocks[0].images[0].image_id)
+
+
+def test_a_withdrawal_mends_where_the_directory_has_its_points(base: Path, catalogue: Path, complete: Path, blocks: list[Block]) -> None:
+    """As docs/quality.md advises: else the block, when it comes again, would not find them, and begin them anew."""
+    shared = np.intersect1d(blocks[0].point_ids, np.concatenate([block.point_ids for block in blocks[1:]]))
+    store = Store(base)
+    directory = group_of(store.root, "directory")
+    table = read_table(directory)
+    wrong = np.flatnonzero(np.isin(table["hash"], hash_ids(shared)))
+    set_rows(directory, "cell", wrong, table["cell"][wrong] + 1)
+    store.commit()
+    assert {problem.kind for problem in verify(str(base), HERE).problems} == {"directory"}
+    withdraw(str(base), HERE, block=blocks[0].block_id)
+    assert verify(str(base), HERE).ok
+    run(Catalogue.open(catalogue), str(base), HERE)
+    assert verify(str(base), HERE).ok
+    same_network(base, complete)

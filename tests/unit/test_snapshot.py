@@ -15,7 +15,7 @@ from stores import COVER, METADATA, image_columns, new, random_cell, sub_min, wr
 
 import submin
 from submin.errors import QueryError
-from submin.storage.arrays import append_table, group_of, hash_ids
+from submin.storage.arrays import append_table, group_of, hash_ids, read_table
 from submin.storage.schema import LEDGER_COLUMNS, write_cell, write_sub_min
 from submin.storage.snapshot import Snapshot
 
@@ -148,6 +148,19 @@ def test_directory_finds_the_last_cell_of_a_point(tmp_path: Path, entries_at_a_t
     some = whole.directory_of(wanted[:2])
     assert len(some) == 1
     np.testing.assert_array_equal(some.cells_of(wanted[:2]), [44, -1])
+
+
+@pytest.mark.parametrize(("entries", "kept"), [(3, True), (2, False)])
+def test_a_large_directory_is_not_read_ahead(tmp_path: Path, entries: int, kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    place, ids = new(tmp_path), np.array(["a", "b", "c"])
+    write(place, 1, lambda root: append_table(group_of(root, "directory"), {"hash": hash_ids(ids), "cell": np.arange(3)}))
+    monkeypatch.setattr("submin.storage.snapshot.DIRECTORY_AHEAD", entries)
+    snapshot = Snapshot.open(place)
+    snapshot.read_ahead()
+    read: list[Any] = []
+    monkeypatch.setattr("submin.storage.snapshot.read_table", lambda *asked: read.append(asked) or read_table(*asked))
+    np.testing.assert_array_equal(snapshot.candidate_cells(ids), [0, 1, 2])
+    assert (not read) == kept
 
 
 def test_ledger_comes_back(tmp_path: Path) -> None:

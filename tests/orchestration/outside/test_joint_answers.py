@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from growing import HERE, with_more
-from numpy.typing import NDArray
 from whole_network import points, truth
 
 import submin
@@ -17,8 +16,6 @@ from orchestration.reconcile import reconcile
 from submin.storage.catalogue_schema import Block
 from submin.storage.network import Network
 from submin.storage.reconciled import read_changes
-
-Array = NDArray[np.float64]
 
 
 def ways_noted(monkeypatch: pytest.MonkeyPatch) -> list[bool]:

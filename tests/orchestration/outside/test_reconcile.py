@@ -15,7 +15,6 @@ import pytest
 import shapely
 from growing import HERE, Growing, ends_of_a_pass, quiet, with_more
 from networks import area_of, rewrite
-from numpy.typing import NDArray
 from whole_network import excess, points, same, truth, whole_network
 
 import submin
@@ -33,8 +32,6 @@ from submin.storage.catalogue_schema import Block
 from submin.storage.repository import versions
 from submin.storage.simulated import write_scene
 from submin.storage.snapshot import Snapshot
-
-Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize(("tile_km", "overlap_km"), [(40.0, 0.0), (40.0, 15.0), (40.0, 39.0), (25.0, 10.0), (100.0, 50.0)])
