@@ -87,7 +87,7 @@ def adjust_block(block: BlockRays, ellipsoid: Ellipsoid) -> BlockAdjustment:
             return BlockAdjustment(block.block_id, every, Status(Cause.UNSEEN, False, 0, *blind).message(images.ids, block.ids))
         if np.bincount(rays.point).max() < 2:
             return BlockAdjustment(block.block_id, every, None)
-        result = adjust(images, rays, start)
+        result = adjust(images, rays, start, to_rest=False)
         if result.status.cause not in (Cause.CONVERGED, Cause.FEW_AGREE):  # that few agree is told from the rays, settled or not
             return BlockAdjustment(block.block_id, every, result.status.message(images.ids, block.ids))
         accepted = np.empty_like(every)

@@ -43,6 +43,8 @@ Array = NDArray[np.float64]
 ROBUST_ITERATIONS = 6
 SETTLED_WEIGHT = 0.1
 """Robust weights that change less have done their work: they only have to find the neighbourhood in which rays are judged."""
+HONEST_WEIGHT = 0.24
+"""Where all robust weights are larger they have nothing to do: no ray is six sigmas off, or 4.3 where it is checked in one direction."""
 MAX_ITERATIONS = 40
 FREE_DECISIONS = 12
 """Iterations in which a rejected ray may come back; after them rays only go, so that the adjustment ends."""
@@ -54,12 +56,15 @@ CONVERGED_SIGMAS = 2e-6
 """A step that moves no ray by more than this, in sigmas of its measurement, is none."""
 CONVERGED_METRES = 1e-5
 NEAR_ENOUGH_SIGMAS = 1e-2
-"""A step that moves images by less is the last one, too, where it was linear to `CONVERGED_SIGMAS`: another one would find nothing."""
+"""A step that moves images and points by less changes no decision that was sure, and is the last one where it was linear to
+`CONVERGED_SIGMAS`: another one would find nothing."""
 PATIENCE = 4
 RESTLESS = 0.05
 """When after so many iterations decisions still change about this part of the rays, images are judged: a bad camera may be why."""
 NEAR_SIGMAS = 0.3
-"""Images whose last step moved no ray by more are near enough to their solution to tell how sure a decision about a ray is."""
+"""Images whose last step moved no ray by more are near enough to their solution to tell how sure a decision about a ray is. Where no ray is
+far off (`HONEST_WEIGHT`) so are those whose step was linear to `NEAR_ENOUGH_SIGMAS`: weakly determined images move far, their points along
+with them, and what is still to be rejected will not move them far."""
 HALVINGS = 10
 """A step that makes matters worse is halved so many times before it is taken as it is, or not at all."""
 RUNAWAY = 4.0
@@ -129,7 +134,7 @@ class Adjustment:
 
     @property
     def converged(self) -> bool:
-        """True when the last step was none and all decisions stood."""
+        """True when all decisions stood and nothing was left to be moved, see `adjust`."""
         return self.status.converged
 
     @property
@@ -178,10 +183,12 @@ class _Step:
     shortened: bool
 
 
-def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None = None) -> Adjustment:
+def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None = None, *, to_rest: bool = True) -> Adjustment:
     """Adjust m images and n ground points by their rays, from ground positions ``start`` (n, 3) and unadjusted cameras.
 
     ``registered`` (n, 3), by default the start, is where the points were registered; they are linearised within reach of it.
+    Without ``to_rest``, where only decisions count, it ends once they stand near the solution and the last step was linear: where another
+    one would leave images and points is then known to thousandths of a sigma of their rays, not to millionths.
 
     Raises
     ------
@@ -196,13 +203,14 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     state = _State.at(images, rays, np.zeros((len(images), images.parameters)), np.zeros(images.prior.shape[1]), start)
     reach = reach_metres(images, rays, state.linear)
     tolerance = round_off(reach)
-    iteration, robust = 0, 0
+    iteration, robust, honest = 0, 0, False
     while robust < ROBUST_ITERATIONS and iteration < MAX_ITERATIONS:
         iteration += 1
         step = _advance(images, rays, state, anchor, reach, weight)
         state, robust = step.state, 0 if step.shortened else robust + 1
         before, weight = weight, robust_weights(state.linear, np.where(state.seen, candidates, 0.0), state.theta)
-        if not step.shortened and np.abs(weight - before).max(initial=0.0) < SETTLED_WEIGHT:
+        honest = bool(weight[before > 0.0].min(initial=1.0) > HONEST_WEIGHT)
+        if not step.shortened and (honest or np.abs(weight - before).max(initial=0.0) < SETTLED_WEIGHT):
             break
 
     weight = (weight > 0.05).astype(np.float64)
@@ -212,22 +220,27 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
     of_set = _sets(images)[rays.image]
     testable = TESTABLE * np.array([1.0 if prior.joint is None else prior.joint.part for prior in images.priors])[rays.image]
     image_statistic, statistic = np.zeros(len(images)), np.zeros(len(rays))
-    converged, judgements, last, before, judged, sure = False, 0, state, weight, weight, False
+    converged, judgements, last, before, judged, sure, variance = False, 0, state, weight, weight, False, images.prior_variance
     while not converged and judgements < MAX_ITERATIONS:
         judgements += 1
         step = _advance(images, rays, state, anchor, reach, weight)
         last, before, state = state, weight, step.state
         if step.shortened:  # far from the solution nothing can be judged
+            sure = False
             continue
         theta = state.theta
         moved = np.abs(moved_rays(state.linear, theta - last.theta)[state.seen]).max(initial=0.0)
+        strayed = _strayed(last, state, weight)
+        near = moved < NEAR_SIGMAS or (honest and strayed < NEAR_ENOUGH_SIGMAS)
         # while images move, what contradicts a point may be their doing: then only the likeliest blunder goes, with no doubt about it
         judgeable = np.where(state.seen, candidates if judgements <= FREE_DECISIONS else weight, 0.0)
+        # what was decided near the solution will not be decided otherwise a hundredth of a sigma on
         if not (sure and moved < NEAR_ENOUGH_SIGMAS and _farthest(last, state, weight) < NEAR_ENOUGH_SIGMAS):
-            doubt = step.noise if moved < NEAR_SIGMAS else 0.0
+            doubt = step.noise if near else 0.0
             judged, statistic = reject_blunders(state.linear, judgeable, theta, step.estimate.covariance, doubt, weight, testable)
             judged = worst_of_sets(judged, weight, statistic, of_set, rays.point)
-        worst = image_statistics(theta, step.estimate.variance, np.where(camera[:, None], images.prior_variance, 0.0))
+            variance = step.estimate.variance
+        worst = image_statistics(theta, variance, np.where(camera[:, None], images.prior_variance, 0.0))
         decided = bool(np.array_equal(judged, weight))
         # images are judged once the rays have been: a blunder must not be blamed on its camera
         restless = judgements % PATIENCE == 0 and np.count_nonzero(judged != weight) > RESTLESS * len(rays)
@@ -235,13 +248,12 @@ def adjust(images: ImageSet, rays: Rays, start: Array, registered: Array | None 
         bad = _to_release(worst, state.linear, judgeable, judged, free, int(adjustable.sum())) & (decided or restless)
         image_statistic = np.where(released, image_statistic, worst.max(axis=1, initial=0.0))
         rests = moved < tolerance * CONVERGED_SIGMAS and _points_stand(last, state, weight, tolerance)
-        converged = decided and not bad.any() and (rests or (moved < NEAR_ENOUGH_SIGMAS and _linear(last, state, weight)))
+        linear = strayed < CONVERGED_SIGMAS and (moved < NEAR_ENOUGH_SIGMAS or (near and not to_rest))
+        converged = decided and not bad.any() and (rests or linear)
         weight, released = judged, released | bad
-        sure = (
-            decided and not bad.any() and moved < NEAR_SIGMAS
-        )  # what was decided here will not be decided otherwise a hundredth of a sigma on
+        sure = decided and not bad.any() and near
         if bad.any():
-            images, state = images.release(bad), replace(state, whitened=None)
+            images, state, honest = images.release(bad), replace(state, whitened=None), False
 
     iteration += judgements
     weight = np.where(state.seen, weight, 0.0)
@@ -281,11 +293,11 @@ def _to_release(
     return bad
 
 
-def _linear(last: _State, state: _State, weight: Array) -> bool:
-    """True when the residuals after a step are those that it promised: the solution of the linear problem is that of the problem."""
+def _strayed(last: _State, state: _State, weight: Array) -> float:
+    """How far the residuals of accepted rays after a step are from those that it promised, in sigmas: how far it was from linear."""
     promised = residuals_of(last.linear, state.theta, state.ground - last.ground)
     found = state.linear.y - moved_rays(state.linear, state.theta)
-    return bool(np.abs(promised - found)[weight > 0.0].max(initial=0.0) < CONVERGED_SIGMAS)
+    return float(np.abs(promised - found)[weight > 0.0].max(initial=0.0))
 
 
 def _points_stand(last: _State, state: _State, weight: Array, tolerance: float) -> bool:

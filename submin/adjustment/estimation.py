@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
@@ -16,7 +15,6 @@ from submin.adjustment.symmetric import between, fill_symmetric, transposed_time
 from submin.errors import NumericalError
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -49,18 +47,10 @@ class ImageEstimate:
         """
         return covariance_of(self.factor.copy(order="F"), self.prior)
 
-    @cached_property
+    @property
     def variance(self) -> Array:
-        """Variances (m, p) of ``theta``, the diagonal of M: half the work of M, which is used when it is there.
-
-        Raises
-        ------
-        NumericalError
-            When the factor is not that of a regular matrix.
-        """
-        if "covariance" in self.__dict__:
-            return np.diagonal(self.covariance).reshape(self.theta.shape)
-        return variances_of(self.factor.copy(order="F"), self.prior).reshape(self.theta.shape)
+        """Variances (m, p) of ``theta``, the diagonal of M; raises as `covariance`."""
+        return np.diagonal(self.covariance).reshape(self.theta.shape)
 
 
 def covariance_of(factor: Array, prior: sp.csr_array) -> Array:
@@ -79,38 +69,6 @@ def covariance_of(factor: Array, prior: sp.csr_array) -> Array:
     if info != 0:
         raise NumericalError(f"the information matrix ({len(factor)} parameters) cannot be inverted")
     return between(prior, fill_symmetric(np.asarray(inverse)).T)  # the transpose is in C order, and the same
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _squares(first: Index, column: Index, value: Array, inverse: Array, out: Array) -> None:
-    """Squared lengths of the rows of ``K X'``, X lower triangular; ``inverse`` is X', its upper triangle."""
-    row = np.empty(len(inverse))
-    for i in range(len(out)):
-        row[:] = 0.0
-        for a in range(first[i], first[i + 1]):
-            of, weight = inverse[column[a]], value[a]
-            for k in range(column[a], len(row)):
-                row[k] += weight * of[k]
-        for k in range(len(row)):
-            out[i] += row[k] * row[k]
-
-
-def variances_of(factor: Array, prior: sp.csr_array) -> Array:
-    """Diagonal (m p,) of ``M = K (L L')^-1 K'``, see `covariance_of`; L (Fortran order) is overwritten.
-
-    Raises
-    ------
-    NumericalError
-        When the factor is not that of a regular matrix.
-    """
-    variances = np.zeros(prior.shape[0])
-    if len(factor):
-        inverse, info = la.lapack.dtrtri(factor, lower=1, overwrite_c=1)
-        if info != 0:
-            raise NumericalError(f"the information matrix ({len(factor)} parameters) cannot be inverted")
-        # the transpose is in C order: its rows are the columns of the inverse
-        _squares(prior.indptr.astype(np.int64), prior.indices.astype(np.int64), prior.data, np.asarray(inverse).T, variances)
-    return variances
 
 
 def reduced_information(information: Array, prior: sp.csr_array) -> Array:

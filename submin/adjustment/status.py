@@ -38,7 +38,7 @@ class Status:
     Attributes
     ----------
     cause : why it ended, and what is wrong with it
-    converged : the last step was none and all decisions stood; so may an adjustment end whose cause is ``UNSEEN``, without these rays
+    converged : all decisions stood and nothing was left to be moved; so may an adjustment end whose cause is ``UNSEEN``, without these rays
     iterations : how many steps there were
     image, point : row of the worst image and point, -1 where the cause names none
     amount : rays that agree (``FEW_AGREE``), convergence angle in degrees (``SINGULAR``), or the last step (``CAMERA``: the farthest that

@@ -7,7 +7,6 @@ import scipy.sparse as sp
 
 from submin.adjustment.adjustment import adjust
 from submin.adjustment.elimination import linearise, moved_by_ground, point_factors
-from submin.adjustment.estimation import variances_of
 from submin.adjustment.images import ImageSet
 from submin.adjustment.intersection import intersect
 from submin.adjustment.priors import APriori, ImagePrior
@@ -50,7 +49,6 @@ def compile_kernels() -> None:
     unpacked(packed(np.eye(2)))
     spread_rows(np.arange(6.0).reshape(3, 2), np.ones(3), np.array(["a", "b", "c"]), 2)
     look_up([(hash_ids(np.array(["a"])), np.zeros(1, dtype=np.int64))], hash_ids(np.array(["a"])))
-    variances_of(np.eye(2, order="F"), sp.eye_array(2, format="csr"))
     # the sums of a tile are large and sparse, which those of two images are not
     many = DENSE_SIZE + 1
     add_into(np.zeros((many, many)), permuted(np.eye(many), np.arange(many), 1), np.arange(many), 1)

@@ -84,6 +84,38 @@ def test_near_the_solution_no_step_is_shortened(flight: Simulated, monkeypatch: 
     assert near.accepted.all() and np.abs(near.ground - flight.ground).max() < 3.0
 
 
+def with_blunders(part: float) -> Simulated:
+    """Five images of 60 points, of whose rays such a part is off by 10 to 100 sigmas."""
+    block, rng = simulate(5, images=image_set(FIVE)), np.random.default_rng(4)
+    bad = rng.random(len(block.rays.image)) < part
+    away = rng.uniform(10.0, 100.0, (len(bad), 2)) * rng.choice([-1.0, 1.0], (len(bad), 2)) * block.rays.sigma
+    return replace(block, rays=replace(block.rays, observed=block.rays.observed + away * bad[:, None]))
+
+
+def test_without_a_ray_far_off_rays_are_judged_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two robust steps less, and the same comes out; with blunders nothing is different."""
+    clean, spoiled = adjusted(with_blunders(0.0)), adjusted(with_blunders(0.1))
+    monkeypatch.setattr(adjustment, "HONEST_WEIGHT", 1.0)
+    robust, same = adjusted(with_blunders(0.0)), adjusted(with_blunders(0.1))
+    assert clean.iterations < robust.iterations and clean.accepted.all() and robust.accepted.all()
+    np.testing.assert_allclose(clean.theta, robust.theta, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(clean.ground, robust.ground, rtol=0.0, atol=1e-5)
+    assert not spoiled.accepted.all() and spoiled.iterations == same.iterations
+    assert np.array_equal(spoiled.accepted, same.accepted) and np.array_equal(spoiled.theta, same.theta)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.02])
+def test_where_decisions_count_another_step_would_hardly_move_anything(part: float) -> None:
+    block = with_blunders(part)
+    start = intersect(block.images, block.rays, len(block.ground))
+    rested, decided = (adjust(block.images, block.rays, start, to_rest=to_rest) for to_rest in (True, False))
+    assert rested.converged and decided.converged and decided.iterations <= rested.iterations
+    assert np.array_equal(rested.accepted, decided.accepted) and np.array_equal(rested.released, decided.released)
+    assert np.nanmax(np.abs(rested.residuals - decided.residuals)) < 1e-3
+    if not part:
+        assert decided.iterations == 2 < rested.iterations
+
+
 @pytest.mark.parametrize("metres", [600.0, 1500.0])
 def test_a_bad_start_is_overcome(flight: Simulated, metres: float, monkeypatch: pytest.MonkeyPatch) -> None:
     near, far = started_aside(flight, 1.0), started_aside(flight, metres)
