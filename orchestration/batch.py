@@ -185,19 +185,20 @@ def _tests(
     met = [(come, of_block) for come, of_block in zip(of_images, cells, strict=True) if of_block is not None]
     if not met:
         return {}, {}
-    shared = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
+    version = Snapshot(base.root, base.place, replace(base.cover))  # without what the cover has worked out: it travels
+    shared = executor.share(version)
 
-    def candidates(first: int, last: int) -> tuple[list[Candidate], Snapshot]:
-        return [Candidate(come.rays, cast(BlockAdjustment, come.adjusted), of_block) for come, of_block in met[first:last]], shared
+    def candidates(first: int, last: int) -> list[Candidate]:
+        return [Candidate(come.rays, cast(BlockAdjustment, come.adjusted), of_block) for come, of_block in met[first:last]]
 
-    groups = _OnDemand(lambda k: candidates(k * TESTED_TOGETHER, (k + 1) * TESTED_TOGETHER), -(-len(met) // TESTED_TOGETHER))
+    groups = _OnDemand(lambda k: (candidates(k * TESTED_TOGETHER, (k + 1) * TESTED_TOGETHER), shared), -(-len(met) // TESTED_TOGETHER))
     outcomes = executor.attempt_all(tested, groups, "test", reporter.stage("testing blocks", len(groups)))
     tests: dict[str, BlockTest] = {}
     killed: dict[str, str] = {}
     for k, (come, _) in enumerate(met):
         outcome = outcomes[k // TESTED_TOGETHER]
         if isinstance(outcome, KilledTaskError):  # one of the group may be to blame: each by itself
-            (alone,) = executor.attempt_all(tested, [candidates(k, k + 1)], "test", lambda: None)
+            (alone,) = executor.attempt_all(tested, [(candidates(k, k + 1), version)], "test", lambda: None)
             if isinstance(alone, KilledTaskError):
                 killed[come.block.block_id] = f"its test by the network {KILLED}"
                 continue

@@ -54,8 +54,7 @@ class Gate:
         """``cells`` : all that blocks will ask for, ascending."""
         self._snapshot, self._cells = snapshot, cells
         self._networks: dict[int, Network] = {}
-        self._passes: NDArray[np.str_] | None = None
-        self._tile_images: dict[int, NDArray[np.int32]] = {}
+        self._images: dict[int, tuple[NDArray[np.int32], NDArray[np.str_]]] = {}
         self._latest: tuple[tuple[int, int], SubMin] | None = None
 
     def test(self, candidate: Candidate) -> BlockTest | None:
@@ -96,9 +95,8 @@ class Gate:
 
     def _mates(self, tile: int, block: Sequence[NetworkImage]) -> NDArray[np.int32]:
         """Rows of the tile's images that share a pass with an image of a block."""
-        if self._passes is None:
-            self._passes = self._snapshot.image_columns(["pass_id"])["pass_id"]
-        if tile not in self._tile_images:
-            self._tile_images[tile] = self._snapshot.tile_images(tile)
-        rows = self._tile_images[tile]
-        return rows[np.isin(self._passes[rows], [image.pass_id for image in block])]
+        if tile not in self._images:
+            rows = self._snapshot.tile_images(tile)
+            self._images[tile] = rows, np.concatenate([run["pass_id"] for run in self._snapshot.image_rows(rows, ["pass_id"])])
+        rows, passes = self._images[tile]
+        return rows[np.isin(passes, [image.pass_id for image in block])]

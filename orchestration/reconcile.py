@@ -24,7 +24,7 @@ from submin.errors import InputError
 from submin.network.outside_messages import Elimination, Message, State, complete, eliminate, front_of
 from submin.network.sub_min import add_sums
 from submin.network.whitened_vectors import Vectors, vectors_of
-from submin.storage.commit import begin_change, commit
+from submin.storage.commit import begin_change, commit, unread
 from submin.storage.dense_reader import is_dense
 from submin.storage.reconciled import (
     ImageDirectory,
@@ -225,9 +225,10 @@ def distribute_node(
     writes: icechunk.ForkSession, tree: str, place: int, node: TreeNode, messages: Sequence[Message], above: NodeDone | None
 ) -> NodeDone:
     """The posterior state of a node's front, from that of the node above; its elimination is kept, for queries over several tiles."""
+    writes = unread(writes)  # what a task was given stays in memory as long as what it gives
     done, _ = eliminate_node(node, messages)
     write_elimination(zarr.open_group(writes.store, mode="r+"), tree, place, done)
-    return NodeDone(complete(done, None if above is None else above.state), writes)
+    return NodeDone(complete(done, None if above is None else above.state), unread(writes))
 
 
 def writes_of(done: NodeDone) -> icechunk.ForkSession:
@@ -239,12 +240,13 @@ def distribute_tile(
     writes: icechunk.ForkSession, base: Snapshot, tree: str, place: int, node: TreeNode, vectors: Vectors, above: NodeDone | None
 ) -> icechunk.ForkSession:
     """The posterior state of a tile's vectors, written."""
+    writes = unread(writes)
     done, _ = eliminate_tile(base, node, vectors)
     root = zarr.open_group(writes.store, mode="r+")
     write_elimination(root, tree, place, done)
     state = complete(done, None if above is None else above.state)
     write_tile_state(root, base.cover.tile_name(node.tile), tree, place, vectors, state)
-    return writes
+    return unread(writes)
 
 
 def eliminate_tile(base: Snapshot, node: TreeNode, vectors: Vectors) -> tuple[Elimination, Message]:

@@ -22,6 +22,7 @@ from submin.network.network_image import NetworkImage, image_set
 from submin.network.registration import Located, LooseRays, locate
 from submin.network.sub_min import add_sums, factor
 from submin.sensors import sensor_named, width_of
+from submin.storage.commit import unread
 from submin.storage.schema import write_cell, write_sub_min
 from submin.storage.snapshot import Snapshot
 from submin.tiling.cover import Cover
@@ -122,6 +123,7 @@ def update_tile(
 
     ``origins`` are other cells from which points arrive, by the own cell to which they go.
     """
+    writes = unread(writes)  # what a task was given stays in memory as long as what it gives
     root = zarr.open_group(writes.store, mode="r+")
     snapshot = Snapshot(root, "network", cover, width_of(image.sensor for image in new_images))
     numbers = cover.cells_held(tile)
@@ -136,7 +138,7 @@ def update_tile(
     seen = union_of_images(held)
     if not len(seen):  # the last ray has gone
         emptied = {cell.number: CellReport.empty() for cell in held if Cover.owner(cell.number) == tile}
-        return TileReport(tile, tuple(emptied), emptied, True, False, (), (), True, writes)
+        return TileReport(tile, tuple(emptied), emptied, True, False, (), (), True, unread(writes))
     members = sorted(zip(_images(snapshot, seen, new_images), seen.tolist(), strict=True), key=lambda member: member[0].image_id)
     rows = np.array([row for _, row in members], dtype=np.int32)
     images = image_set(
@@ -177,7 +179,7 @@ def update_tile(
     own = np.concatenate([np.full(len(cell), Cover.owner(cell.number) == tile) for cell in held])
     contradicted = contradicted_points(images, together.rays, result, np.concatenate([cell.point_ids for cell in held]), own)
     flagged = _flagged(result, images, rows)
-    return TileReport(tile, tuple(changed), reports, lost, lost_elsewhere, flagged, contradicted, result.converged, writes)
+    return TileReport(tile, tuple(changed), reports, lost, lost_elsewhere, flagged, contradicted, result.converged, unread(writes))
 
 
 def _same_state(one: Cell, other: Cell) -> bool:
@@ -207,6 +209,7 @@ def factor_tile(
     emptied : cells that have lost all points, which the store does not show yet
     released : rows of all images in the network whose prior is released
     """
+    reads, writes = unread(reads), unread(writes)
     reads.merge(*updates)
     snapshot = Snapshot(zarr.open_group(reads.store, mode="r"), "network", cover, width_of(image.sensor for image in new_images))
     held = [number for number in cover.cells_held(tile) if number not in emptied]
@@ -222,7 +225,7 @@ def factor_tile(
         image_set(images, snapshot.metadata.ellipsoid, snapshot.metadata.parameters),
     )
     write_sub_min(zarr.open_group(writes.store, mode="r+"), cover.tile_name(tile), sub_min, list(found))
-    return TileFactored(tile, len(rows), writes)
+    return TileFactored(tile, len(rows), unread(writes))
 
 
 def _images(snapshot: Snapshot, rows: NDArray[np.int32], new: Sequence[NetworkImage]) -> list[NetworkImage]:

@@ -32,7 +32,9 @@ RECORD_CHUNK = 1 << 20
 ALIGNED = 8
 """Parts of a record begin at multiples of so many bytes."""
 TABLE_CHUNK = 1 << 16
-"""Rows of a chunk of a table."""
+"""Rows of a chunk of a table, where it says nothing else."""
+LETTERS_CHUNK = 1 << 20
+"""Bytes of a chunk of a column of texts, likewise."""
 PLAIN = (Crc32cCodec(),)
 """Chunks as they are, each with a checksum: numbers do not compress, and what was damaged must not be read as another number."""
 WRITTEN_WHOLE: ArrayConfigLike = {"write_empty_chunks": True}
@@ -279,15 +281,20 @@ async def _parts(group: zarr.AsyncGroup, names: frozenset[str] | None) -> dict[s
     return parts
 
 
-def create_table(parent: zarr.Group, name: str, columns: Mapping[str, str]) -> zarr.Group:
-    """An empty table; ``columns`` gives each column's type: a numpy name, or ``text``."""
+def create_table(
+    parent: zarr.Group, name: str, columns: Mapping[str, str], *, rows: int = TABLE_CHUNK, letters: int = LETTERS_CHUNK
+) -> zarr.Group:
+    """An empty table; ``columns`` gives each column's type: a numpy name, or ``text``.
+
+    A chunk has so many ``rows``, or ``letters`` (bytes) of texts: whoever wants one row of it decodes all of them.
+    """
     group = parent.create_group(name)
     for column, kind in columns.items():
         if kind == "text":
-            group.create_array(column, shape=(0,), chunks=(1 << 20,), dtype="uint8", compressors=PACKED)
-            group.create_array(column + ".ends", shape=(0,), chunks=(TABLE_CHUNK,), dtype="int64", compressors=PACKED)
+            group.create_array(column, shape=(0,), chunks=(letters,), dtype="uint8", compressors=PACKED)
+            group.create_array(column + ".ends", shape=(0,), chunks=(rows,), dtype="int64", compressors=PACKED)
         else:
-            group.create_array(column, shape=(0,), chunks=(TABLE_CHUNK,), dtype=kind, compressors=PACKED)
+            group.create_array(column, shape=(0,), chunks=(rows,), dtype=kind, compressors=PACKED)
     group.attrs["columns"] = dict(columns)
     return group
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import icechunk
 
 from submin.errors import ConflictError
@@ -52,3 +54,12 @@ def commit(session: icechunk.Session, version: int, message: str) -> None:
         raise ConflictError(
             "another run committed to this network meanwhile; nothing of this batch was written: give the same command again"
         ) from None
+
+
+def unread(writes: icechunk.ForkSession) -> icechunk.ForkSession:
+    """A fork with the same changes, which holds nothing of what was read through it: that is the names of all that its version has.
+
+    Forks wait in memory until a change is committed, one of every task.
+    """
+    fork: icechunk.ForkSession = pickle.loads(pickle.dumps(writes))
+    return fork

@@ -19,7 +19,16 @@ import zarr
 from submin.errors import QueryError, StoreError
 from submin.storage.arrays import create_table
 from submin.storage.place import is_remote, reason_of, storage_of, unreachable
-from submin.storage.schema import CHANGE_COLUMNS, DIRECTORY_COLUMNS, FLAG_COLUMNS, IMAGE_COLUMNS, LEDGER_COLUMNS, NetworkMetadata
+from submin.storage.schema import (
+    CHANGE_COLUMNS,
+    DIRECTORY_COLUMNS,
+    FLAG_COLUMNS,
+    IMAGE_CHUNK,
+    IMAGE_COLUMNS,
+    IMAGE_LETTERS,
+    LEDGER_COLUMNS,
+    NetworkMetadata,
+)
 
 icechunk.set_logs_filter("icechunk=error")
 BRANCH = "main"
@@ -95,7 +104,7 @@ def create_network(place: str, metadata: NetworkMetadata, begin: Callable[[zarr.
         root = zarr.create_group(session.store, attributes=metadata.to_attributes() | {"version": 0})
         root.create_group("cells")
         root.create_group("tiles")
-        create_table(root, "images", IMAGE_COLUMNS)
+        create_table(root, "images", IMAGE_COLUMNS, rows=IMAGE_CHUNK, letters=IMAGE_LETTERS)
         create_table(root, "ledger", LEDGER_COLUMNS)
         create_table(root, "directory", DIRECTORY_COLUMNS)
         create_table(root, "flags", FLAG_COLUMNS)

@@ -30,6 +30,10 @@ IMAGE_COLUMNS = {
     "width": "int64", "height": "int64", "acquired": "text", "seconds": "float64", "footprint": "text", "licence": "text",
     "a_priori": "text", "released": "uint8", "withdrawn": "uint8",
 }  # fmt: skip
+IMAGE_CHUNK = 1 << 12
+"""Rows of a chunk of the image table: every task reads the few that its tile sees."""
+IMAGE_LETTERS = 1 << 18
+"""Bytes of a chunk of its texts: some hundred cameras."""
 LEDGER_COLUMNS = {
     "block_id": "text", "content": "text", "status": "text", "reason": "text", "version": "int64",
     "images": "int64", "rays": "int64", "rays_rejected": "int64",

@@ -190,17 +190,18 @@ class Snapshot:
 
     def plain_images(self, rows: Sequence[int] | NDArray[np.integer]) -> list[NetworkImage]:
         """Images of these rows (ascending), views of correlated control without their rows of the common factor (`with_joint`)."""
-        table = group_of(self.root, "images")
         wanted = [k for k in IMAGE_COLUMNS if k not in ("platform", "acquired", "footprint", "licence", "withdrawn")]
-        if not len(rows):
-            return []
+        return [image for columns in self.image_rows(rows, wanted) for image in network_images(columns)]
+
+    def image_rows(self, rows: Sequence[int] | NDArray[np.integer], wanted: Sequence[str]) -> list[dict[str, NDArray[Any]]]:
+        """Columns of some rows (ascending) of the image table, in runs of neighbours one after the other."""
         wanted_rows = np.asarray(rows, dtype=np.int64)
-        found: list[NetworkImage] = []
+        if not len(wanted_rows):
+            return []
         # rows of a long gap between neighbours are not decoded; runs that lie in one chunk are read together
         runs = np.split(wanted_rows, np.flatnonzero(np.diff(wanted_rows) > READ_OVER_ROWS) + 1)
-        for run, columns in zip(runs, read_spans(table, wanted, [(int(run[0]), int(run[-1]) + 1) for run in runs]), strict=True):
-            found.extend(network_images({name: values[run - run[0]] for name, values in columns.items()}))
-        return found
+        spans = read_spans(group_of(self.root, "images"), wanted, [(int(run[0]), int(run[-1]) + 1) for run in runs])
+        return [{name: values[run - run[0]] for name, values in columns.items()} for run, columns in zip(runs, spans, strict=True)]
 
     def image_priors(self) -> tuple[ImagePrior, ...]:
         """What is believed a priori of every image, by row; cameras are not read."""

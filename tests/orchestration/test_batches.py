@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from icechunk import ForkSession
 from networks import accepted_rays, area_of, by_image, fuse, rewrite, same_network
 
 import submin
 from orchestration.create import create
-from orchestration.executors import SerialExecutor, executor_for
+from orchestration.executors import Advance, SerialExecutor, executor_for
 from orchestration.progress import Silent
+from orchestration.reconcile import reconcile
 from orchestration.run import run
 from submin.errors import CatalogueError
 from submin.simulation.region import SimulatedRegion
@@ -61,6 +65,46 @@ def test_workers_leave_the_same_network(region: SimulatedRegion, catalogue: Path
     with executor_for(2) as executor:
         assert fuse(catalogue, network, area_of(region), executor=executor).fused == 12
     same_network(base, network)
+
+
+class Keeping(SerialExecutor):
+    """Keeps, as a cluster does, the forks that tasks were given, and those in what they give."""
+
+    def __init__(self) -> None:
+        self.forks: list[ForkSession] = []
+
+    def submit_all(self, function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], name: str, advance: Advance) -> list[Any]:
+        every = list(arguments)
+        done = super().submit_all(function, every, name, advance)
+        self._keep([*(value for args in every for value in args), *done])
+        return done
+
+    def submit(self, function: Callable[..., Any], arguments: tuple[Any, ...], name: str) -> Any:
+        done = super().submit(function, arguments, name)
+        self._keep([*arguments, done])
+        return done
+
+    def _keep(self, values: Iterable[Any]) -> None:
+        for value in values:
+            fork = getattr(value, "writes", value)
+            if isinstance(fork, ForkSession):
+                self.forks.append(fork)
+
+
+def test_nothing_is_read_through_forks_that_wait(
+    region: SimulatedRegion, catalogue: Path, base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fork through which anything is read or written holds the names of all that a version has, and each task has its own."""
+    opened, network, keeping = [], tmp_path / "network", Keeping()
+    store = ForkSession.store.fget
+    monkeypatch.setattr(ForkSession, "store", property(lambda fork: opened.append(fork) or store(fork)))
+    fuse(catalogue, network, area_of(region), executor=keeping, batch_blocks=5)
+    same_network(base, network)
+    fused = len(keeping.forks)
+    reconcile(str(network), keeping)
+    tiles = len(Snapshot.open(str(network)).tile_numbers())
+    assert fused > 3 * tiles and len(keeping.forks) - fused > 2 * tiles and len(opened) > 3 * tiles
+    assert not {id(fork) for fork in opened} & {id(fork) for fork in keeping.forks}
 
 
 @pytest.mark.parametrize("workers", [0, 1])

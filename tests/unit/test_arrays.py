@@ -185,7 +185,8 @@ def cut(content: dict[str, AnyArray], start: int | None, stop: int | None) -> di
 
 
 def filled(content: dict[str, AnyArray], pieces: list[int]) -> zarr.Group:
-    table = create_table(root(), "table", COLUMNS)
+    """A table of small chunks, so that most spans of it are of several."""
+    table = create_table(root(), "table", COLUMNS, rows=4, letters=16)
     for start, stop in zip([0, *pieces], [*pieces, None], strict=True):
         append_table(table, cut(content, start, stop))
     return table

@@ -10,7 +10,7 @@ from stores import COVER, image_columns, new, random_cell, write
 
 from submin.errors import ConflictError, StoreError
 from submin.storage.arrays import append_table, group_of
-from submin.storage.commit import begin_change, commit
+from submin.storage.commit import begin_change, commit, unread
 from submin.storage.repository import versions
 from submin.storage.schema import write_cell
 from submin.storage.snapshot import Snapshot
@@ -45,6 +45,19 @@ def test_a_change_starts_from_a_version_that_it_does_not_alter(tmp_path: Path) -
     assert (base.version, base.image_count(), len(base.images()), base.cell_numbers()) == ("v1", 3, 3, ())
     after = Snapshot.open(place)
     assert (after.version, after.image_count(), after.cell_numbers()) == ("v2", 5, (number,))
+
+
+def test_a_fork_without_what_was_read_has_all_that_was_written(tmp_path: Path) -> None:
+    place, number = new(tmp_path), COVER.cells_owned(1)[2]
+    session, _ = begin_change(place, Snapshot.open(place).number)
+    given = session.fork()
+    fork = unread(given)
+    write_cell(zarr.open_group(fork.store, mode="r+"), COVER.cell_name(number), random_cell(number), 0.0, 0)
+    assert fork.has_uncommitted_changes and not given.has_uncommitted_changes
+    session.merge(unread(fork))
+    zarr.open_group(session.store, mode="r+").attrs["version"] = 1
+    commit(session, 1, "one cell")
+    assert Snapshot.open(place).cell_numbers() == (number,)
 
 
 def test_a_change_that_is_given_up_leaves_nothing(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def test_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
 def test_an_empty_folder_becomes_a_network_and_keeps_nothing_of_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "network").mkdir()
 
-    def full(*args: Any) -> None:
+    def full(*args: Any, **chunks: int) -> None:
         raise OSError(28, "No space left on device")
 
     for place in ("network", "other"):
