@@ -14,8 +14,8 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -112,11 +112,13 @@ def trial(
                 address = f"tcp://127.0.0.1:{port}"
                 scheduler, _ = stack.enter_context(cluster(scene.folder, scene.workers, name, port))
             where = ("--scheduler", address)
+        # connected before the run begins: the first tasks of some stages are over soon
+        next_busy = stack.enter_context(busy_workers(str(where[1]), kind.removeprefix(IN_STAGE))) if kind.startswith(IN_STAGE) else None
         first = stack.enter_context(scene.run(network, f"{name}-first", *where))
         wait_until(lambda: begun(network), first)
         began = time.monotonic()
         moment(first, network)
-        busy = busy_worker(str(where[1]), kind.removeprefix(IN_STAGE), first) if kind.startswith(IN_STAGE) else None
+        busy = next_busy(first) if next_busy else None
         if first.process.poll() is not None:
             raise TooLate
         workers = [] if outside else first.workers()
@@ -166,24 +168,27 @@ def trial(
     return Trial(kind, passed, found.version, seconds, coordinates, covariance, readings, tuple(faults))
 
 
-def busy_worker(address: str, stage: str, command: Command) -> int:
-    """Process of the worker that is busy with a task of a stage; waits for one.
+@contextmanager
+def busy_workers(address: str, stage: str) -> Iterator[Callable[[Command], int]]:
+    """Gives the process of the worker that is next busy with a task of a stage; waits for one.
 
-    Raises
-    ------
-    TooLate
-        When the command ends before.
+    It raises `TooLate` when the command ends before.
     """
     from distributed import Client
 
     with Client(address, timeout="60s") as client:
         processes = client.run(os.getpid)
-        while command.process.poll() is None:
-            for worker, keys in client.processing().items():
-                if any(str(key).startswith(f"{stage}-") for key in keys):
-                    return int(processes[worker])
-            time.sleep(0.001)
-    raise TooLate
+
+        def next_busy(command: Command) -> int:
+            while command.process.poll() is None:
+                for worker, keys in client.processing().items():
+                    if any(str(key).startswith(f"{stage}-") for key in keys):
+                        # one that was killed in the trial before may have come again since
+                        return int((processes if worker in processes else client.run(os.getpid))[worker])
+                time.sleep(0.001)
+            raise TooLate
+
+        yield next_busy
 
 
 def begun(network: Path) -> bool:
@@ -242,7 +247,7 @@ def after(seconds: float) -> Moment:
 
 
 def drawn(kind: str, batches: int, seconds: float, rng: random.Random) -> Moment:
-    """A random moment of a run of so many batches and seconds that suits what is killed."""
+    """A random moment of a run of so many batches that suits what is killed; one that is counted in seconds is before ``seconds``."""
     if kind == IN_COMMIT:
         return in_commit(rng.randrange(batches), rng.uniform(0.0, LONGEST_COMMIT))
     if kind == AFTER_COMMIT:
@@ -270,14 +275,17 @@ def measure(scale: float, workers: int, kills: int = 30, seed: int | None = None
             stack.enter_context(cluster(scene.folder, scene.workers, "cluster", port))
         standing = Standing(f"tcp://127.0.0.1:{port}" if workers else "", stack.enter_context(Reader()))
         stack.enter_context(suppress(KeyboardInterrupt))  # ends with the rows so far
+        latest = seconds
         while len(rows) < kills:
             kind, name = kinds[len(rows) % len(kinds)], f"kill-{len(rows) + 1}"
             try:
-                moment = drawn(kind, batches, seconds, rng)
+                moment = drawn(kind, batches, latest, rng)
                 done = trial(scene, undisturbed, kind, moment, name, rng, standing)
             except TooLate:
+                latest *= 0.5 if kind.startswith(IN_STAGE) else 1.0  # tasks of some stages are over soon
                 shutil.rmtree(scene.folder / name)
                 continue
+            latest = seconds
             rows.append({"kill": len(rows) + 1, "seed": seed, **done.to_row()})
             if out is not None:
                 write_record(out, "faults", scale, workers, rows)

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,20 @@ _COMMAND = "from orchestration.cli import main; main()"
 _ENVIRONMENT = {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
-def submin_json(*words: object, cores: int | None = None) -> Mapping[str, Any]:
+def submin_json(*words: object, cores: Sequence[int] | None = None) -> Mapping[str, Any]:
     """What a command of ``submin`` prints with ``--json``; a process of its own, so that its memory is its own.
 
-    ``cores`` bounds those that it and its workers may use (Linux only).
+    ``cores`` are places among those of this process, the only ones that it and its workers may use then (Linux only).
 
     Raises
     ------
     RuntimeError
         With what it said, when it ends with an error; exit code 1 is an answer.
     """
-    bound = [] if cores is None else ["taskset", "--cpu-list", ",".join(map(str, sorted(os.sched_getaffinity(0))[:cores]))]
+    bound = []
+    if cores is not None:
+        there = sorted(os.sched_getaffinity(0))
+        bound = ["taskset", "--cpu-list", ",".join(str(there[place]) for place in cores)]
     done = subprocess.run(
         [*bound, sys.executable, "-c", _COMMAND, *map(str, words), "--json"], capture_output=True, text=True, env=os.environ | _ENVIRONMENT,
         check=False,
