@@ -5,6 +5,7 @@ Imports nothing that takes time: the command line must answer to Ctrl-C while it
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -16,7 +17,7 @@ from types import FrameType
 
 PATIENCE_SECONDS = 10.0
 SOON_SECONDS = 0.05
-"""After which a signal that was swallowed is sent once more: a finaliser has ended by then."""
+"""After which a signal that came at a bad moment is sent once more: a finaliser, or a collection of garbage, has ended by then."""
 SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 
 
@@ -37,10 +38,11 @@ class Stopped(BaseException):
 def signals_stop() -> Iterator[None]:
     """While the body runs, the first of `SIGNALS` raises `Stopped` where the program is.
 
-    Where that is a finaliser or a callback of the garbage collector, Python would print what is raised and go on: then the signal is
-    sent once more, soon after. (Code that swallows every exception in another way swallows this one too.) Later signals leave the
-    program to clean up in peace, for so long as that may take; then they end the process as it is, which loses nothing that is
-    committed.
+    Where that is a finaliser, Python would print what is raised and go on: then the signal is sent once more, soon after. So it is where
+    a callback of the garbage collector runs, which is not broken off: what it had begun (Dask times every collection) it could not end
+    afterwards, and Python would print that. (Code that swallows every exception in another way swallows this one too.) Later signals
+    leave the program to clean up in peace, for so long as that may take; then they end the process as it is, which loses nothing that
+    is committed.
     """
     first: float | None = None
     again: list[threading.Timer] = []
@@ -48,10 +50,18 @@ def signals_stop() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal first
         if first is None:
+            if _in_the_collector(frame):
+                send_again(number)
+                return
             first = time.monotonic()
             raise Stopped(number)
         if time.monotonic() - first > PATIENCE_SECONDS:
             os._exit(Stopped(number).exit_code)
+
+    def send_again(number: int) -> None:
+        again.append(threading.Timer(SOON_SECONDS, signal.pthread_kill, (threading.main_thread().ident, number)))
+        again[-1].daemon = True
+        again[-1].start()
 
     def swallowed(what: sys.UnraisableHookArgs) -> None:
         nonlocal first
@@ -59,9 +69,7 @@ def signals_stop() -> Iterator[None]:
             said(what)
             return
         first = None
-        again.append(threading.Timer(SOON_SECONDS, signal.pthread_kill, (threading.main_thread().ident, what.exc_value.number)))
-        again[-1].daemon = True
-        again[-1].start()
+        send_again(what.exc_value.number)
 
     # a signal that is ignored already (a job in the background) stays ignored
     before = {each: signal.signal(each, stop) for each in SIGNALS if signal.getsignal(each) is not signal.SIG_IGN}
@@ -76,6 +84,14 @@ def signals_stop() -> Iterator[None]:
         sys.unraisablehook = said
         for each, handler in before.items():
             signal.signal(each, handler)
+
+
+def _in_the_collector(frame: FrameType | None) -> bool:
+    """True where a callback of the garbage collector runs."""
+    codes = {getattr(callback, "__code__", None) for callback in gc.callbacks}  # a method gives that of its function
+    while frame is not None and frame.f_code not in codes:
+        frame = frame.f_back
+    return frame is not None
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import subprocess
 import sys
@@ -71,6 +72,42 @@ def test_a_signal_that_a_finaliser_swallows_is_not_lost(times: int, capsys: pyte
     assert stopped.value.exit_code == 143
     assert sys.unraisablehook is before
     assert capsys.readouterr().err == ""
+
+
+class Timing:
+    """Times collections as Dask does: cannot end one that it did not begin. Signals come while it does, once in each phase."""
+
+    def __init__(self) -> None:
+        self.begun, self.left = False, ["start", "stop"]
+
+    def __call__(self, phase: str, info: dict[str, int]) -> None:
+        self.measure(phase)
+
+    def measure(self, phase: str) -> None:
+        if phase in self.left:
+            self.left.remove(phase)
+            signal.raise_signal(signal.SIGTERM)
+        assert self.begun == (phase == "stop")
+        self.begun = phase == "start"
+
+
+@pytest.mark.parametrize("phases", [["start"], ["stop"], ["start", "stop"]])
+def test_a_callback_of_the_collector_is_not_broken_off(phases: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda of: told.append(of.exc_type))
+    timing = Timing()
+    timing.left = list(phases)
+    callback = timing.__call__
+    gc.collect()
+    gc.callbacks.append(callback)
+    try:
+        with pytest.raises(Stopped) as stopped, signals_stop():
+            gc.collect()
+            after = len(timing.left)
+            time.sleep(5.0)
+    finally:
+        gc.callbacks.remove(callback)
+    assert (stopped.value.exit_code, after, timing.begun, told) == (143, 0, False, [])
 
 
 class Failing:
